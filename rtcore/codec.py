@@ -1,0 +1,115 @@
+"""Messages to bytes and back, with everything refused counted: what both buses share."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Generic
+
+import msgspec
+
+from rtcore.channels import Channel, MessageT
+from rtcore.lifecycle import RateLimited
+
+LOG_PERIOD_S = 10.0  # a flood of bad messages writes one line per channel and period
+
+_FORBIDDEN_IN_NAME = frozenset("/*$#?@")  # they mean something in a key
+
+
+def key_for(channel: Channel[MessageT], name: str, *, wildcard: bool) -> str:
+    """The channel's key for `name`, below the run's namespace.
+
+    Args:
+        channel: the channel.
+        name: of an environment or process; `*` for all, if `wildcard`; empty on a channel without names.
+        wildcard: whether the caller reads and so may ask for all.
+
+    Raises:
+        ValueError: the name does not fit the channel.
+    """
+    if "{name}" not in channel.key:
+        if name:
+            raise ValueError(f"name = {name!r}: channel {channel.name} has none, so it must be empty")
+    elif not (wildcard and name == "*"):
+        check_name(name)
+    return channel.key_for(name)
+
+
+def check_name(name: str) -> None:
+    """Raise ValueError unless `name` can stand in a key."""
+    if not name or _FORBIDDEN_IN_NAME.intersection(name):
+        raise ValueError(f"name = {name!r}: must be non-empty and without any of / * $ # ? @")
+
+
+class Rejections:
+    """Counts refused messages per channel and logs them at a limited rate. Usable from any thread."""
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._loggers: dict[str, RateLimited] = {}
+
+    def count(self, channel: str, reason: object) -> None:
+        """Count one refused message on the channel called `channel`."""
+        with self._lock:
+            self._counts[channel] += 1
+            logger = self._loggers.get(channel)
+            if logger is None:
+                logger = RateLimited(logging.getLogger(__name__), LOG_PERIOD_S, now_ns=self._now_ns)
+                self._loggers[channel] = logger
+        logger.warning("channel %s: message rejected: %s", channel, reason)
+
+    def counts(self) -> dict[str, int]:
+        """Refused so far, per channel."""
+        with self._lock:
+            return dict(self._counts)
+
+
+class Codec(Generic[MessageT]):
+    """Encodes and decodes one channel's messages within its limits."""
+
+    def __init__(self, channel: Channel[MessageT], rejections: Rejections) -> None:
+        self._channel = channel
+        self._rejections = rejections
+        # Measured on a Step of 300 B: 0.5 us here, 0.3 us with encode_into a shared buffer, beside a put
+        # of 10 us and more. Fresh bytes need no lock between threads.
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._decoder = msgspec.msgpack.Decoder(channel.type)
+
+    def encode(self, message: MessageT) -> bytes:
+        """The message as bytes.
+
+        Raises:
+            TypeError: not of the channel's type.
+            ValueError: larger than the channel allows.
+        """
+        channel = self._channel
+        if type(message) is not channel.type:
+            raise TypeError(
+                f"channel {channel.name} carries {channel.type.__name__}, not {type(message).__name__}"
+            )
+        payload = self._encode(message)
+        if len(payload) > channel.max_bytes:
+            size = f"{len(payload)} bytes"
+            raise ValueError(
+                f"channel {channel.name}: a message of {size}: at most {channel.max_bytes} allowed"
+            )
+        return payload
+
+    def fits(self, size: int) -> bool:
+        """Whether a received message of `size` bytes is within the limit; counts it if not."""
+        if size <= self._channel.max_bytes:
+            return True
+        self._rejections.count(self._channel.name, f"{size} bytes: at most {self._channel.max_bytes} allowed")
+        return False
+
+    def decode(self, payload: bytes) -> MessageT | None:
+        """The message, or None (and one more on the count) if the bytes are not a valid one."""
+        try:
+            return self._decoder.decode(payload)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            self._rejections.count(self._channel.name, error)
+            return None

@@ -1,0 +1,197 @@
+"""What every field of a run's configuration may be: a table of rules, and what fields must keep together."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import sys
+from collections.abc import Callable
+from typing import Literal, get_args, get_origin, get_type_hints
+
+from rtcore.config import ConfigError, RunConfig
+from rtcore.windows import make_schedule
+
+MOST = 10**9  # of anything counted; as seconds (31 years) its nanoseconds still fit a 64-bit message field
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Rule:
+    """What one field may be: the words for people and the test for us."""
+
+    allowed: str
+    holds: Callable[[object], bool]
+
+
+def check(config: RunConfig) -> None:
+    """Every field within its range, and the fields consistent with each other.
+
+    Raises:
+        ConfigError: the first field that is not, by its dotted name, with what is allowed.
+    """
+    _check_section(config, "")
+    _check_together(config)
+
+
+def check_unit(unit_s: float, hz: float) -> None:
+    """A unit holds at least one tick. Whoever derives `env.hz` from `env.speed` asks again.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if round(unit_s * 1e9) < round(1e9 / hz):
+        raise ConfigError("env.unit_s", unit_s, f"must be at least one tick, {1 / hz:g} s at {hz:g} Hz")
+
+
+def _number(interval: str) -> Rule:
+    """A finite number in an interval, written as people write it: `(0, 1]` is 0 < x <= 1."""
+    low, high = map(float, interval[1:-1].split(","))
+
+    def holds(value: object) -> bool:
+        return (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and abs(value) <= sys.float_info.max  # neither NaN nor infinite, nor an integer beyond
+            and (low <= value if interval[0] == "[" else low < value)
+            and (value <= high if interval[-1] == "]" else value < high)
+        )
+
+    return Rule(f"must be in {interval}", holds)
+
+
+def _whole(least: int, most: int = MOST) -> Rule:
+    def holds(value: object) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+    return Rule(f"must be {least}" if least == most else f"must be an integer in {least}..{most}", holds)
+
+
+def _text(pattern: str, allowed: str) -> Rule:
+    compiled = re.compile(pattern)
+
+    def holds(value: object) -> bool:
+        return isinstance(value, str) and compiled.fullmatch(value) is not None
+
+    return Rule(f"must be {allowed}", holds)
+
+
+def _optional(rule: Rule) -> Rule:
+    return Rule(f"{rule.allowed}, or left out", lambda value: value is None or rule.holds(value))
+
+
+def _or_word(word: str, rule: Rule) -> Rule:
+    return Rule(f"{rule.allowed}, or {word!r}", lambda value: value == word or rule.holds(value))
+
+
+def _each(rule: Rule, least: int = 0) -> Rule:
+    def holds(value: object) -> bool:
+        return isinstance(value, tuple) and len(value) >= least and all(map(rule.holds, value))
+
+    return Rule(f"each entry {rule.allowed}" + (f", {least} or more of them" if least else ""), holds)
+
+
+def _choice(choices: tuple[object, ...]) -> Rule:
+    return Rule(f"must be one of {', '.join(map(repr, choices))}", lambda value: value in choices)
+
+
+# Names become parts of keys and of file names, so they keep clear of "/", of blanks and of the wildcards
+# of key expressions (* $ # ?).
+_NAME = _text(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", "1 to 64 of the characters A-Z a-z 0-9 _ . -")
+_ENDPOINT = _text(
+    r"(tcp|udp|tls|quic|ws|unixsock-stream)/[^\s]+", "protocol/address, like tls/192.0.2.1:7447"
+)
+_POSITIVE = _number("(0, inf)")
+_FINITE = _number("(-inf, inf)")
+
+RULES: dict[str, Rule] = {
+    "preset": _NAME,
+    "seed": _whole(0, 2**32 - 1),  # what NumPy and Gymnasium both take
+    "duration_s": _number("[0, 1e9]"),
+    "env.id": _text(r"[^\s]{1,200}", "an environment's name without blanks"),
+    "env.name": _NAME,
+    "env.hz": _optional(_number("[1e-6, 1e6]")),  # a tick of 1 us .. 10^6 s: never 0 ns
+    "env.speed": _optional(_POSITIVE),
+    "env.episode_steps": _whole(1),
+    "env.unit_s": _number("[1e-6, 1e9]"),
+    "env.action_delay_ticks": _whole(0),
+    "env.observe_actions": _whole(0),
+    "env.hold_ticks": _whole(0),
+    "env.count": _whole(1, 1),
+    "env.start_wait_s": _number("[0, 1e9]"),
+    "env.drift.offset": _FINITE,
+    "env.drift.amplitude": _FINITE,
+    "env.drift.omega": _FINITE,
+    "env.drift.phase": _FINITE,
+    "env.reward.k_f": _POSITIVE,
+    "env.reward.control_cost": _number("[0, inf)"),
+    "env.reward.healthy": _FINITE,
+    "learner.utd": _POSITIVE,
+    "learner.learning_starts": _whole(0),
+    "learner.hidden": _each(_whole(1, 65_536), least=1),
+    "learner.batch": _whole(1),
+    "learner.gamma": _number("[0, 1)"),
+    "learner.tau": _number("(0, 1]"),
+    "learner.actor_lr": _POSITIVE,
+    "learner.critic_lr": _POSITIVE,
+    "learner.alpha": _or_word("auto", _POSITIVE),
+    "learner.alpha_lr": _POSITIVE,
+    "learner.target_entropy": _optional(_FINITE),
+    "learner.replay_capacity": _whole(1),
+    "learner.replay_units": _optional(_POSITIVE),
+    "learner.threads": _whole(1, 1024),
+    "learner.schedule.l_f": _whole(1),
+    "learner.schedule.gamma_f": _number("(0, 1]"),
+    "learner.schedule.t_m": _each(_whole(0)),
+    "learner.schedule.g_m": _each(_whole(1)),
+    "learner.forecast.l_p": _whole(1),
+    "learner.forecast.horizon": _optional(_number("[0, inf)")),
+    "learner.forecast.shrink": _number("[0, inf)"),
+    "recorder.port": _whole(1, 65_535),
+    "link.connect": _each(_ENDPOINT),
+    "link.listen": _each(_ENDPOINT),
+}
+"""One row per field; fields that are a Literal or a bool have theirs from their type."""
+
+
+def rule_for(name: str, hint: object) -> Rule:
+    """The rule of the field `name` (dotted) of the type `hint`.
+
+    Raises:
+        KeyError: a field without a rule; a test keeps the table whole.
+    """
+    if get_origin(hint) is Literal:
+        return _choice(get_args(hint))
+    if hint is bool:
+        return Rule("must be true or false", lambda value: isinstance(value, bool))
+    return RULES[name]
+
+
+def _check_section(section: object, prefix: str) -> None:
+    for key, hint in get_type_hints(type(section)).items():
+        name, value = f"{prefix}{key}", getattr(section, key)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            if not isinstance(value, hint):
+                raise ConfigError(name, value, f"must be of type {hint.__name__}")
+            _check_section(value, f"{name}.")
+        elif not (rule := rule_for(name, hint)).holds(value):
+            raise ConfigError(name, value, rule.allowed)
+
+
+def _check_together(config: RunConfig) -> None:
+    env, learner, forecast = config.env, config.learner, config.learner.forecast
+    if env.hz is not None:
+        check_unit(env.unit_s, env.hz)
+    if forecast.kind == "forq" and forecast.basis == "identity" and forecast.l_p < 2:
+        raise ConfigError("learner.forecast.l_p", forecast.l_p, "must be >= 2 for the identity basis")
+    if learner.batch > learner.replay_capacity:
+        raise ConfigError(
+            "learner.batch",
+            learner.batch,
+            f"must be <= learner.replay_capacity, which is {learner.replay_capacity}",
+        )
+    if learner.learning_starts > learner.replay_capacity:
+        raise ConfigError(
+            "learner.learning_starts",
+            learner.learning_starts,
+            f"must be <= learner.replay_capacity, which is {learner.replay_capacity}",
+        )
+    make_schedule(learner.schedule)

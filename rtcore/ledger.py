@@ -1,0 +1,122 @@
+"""What a process has done so far: counters, gauges, histograms and events, as one cumulative message."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter, deque
+from collections.abc import Sequence
+
+from rtcore.histogram import Histogram
+from rtcore.messages import EpisodeReturn, Event, Level, Stats, WindowNotice
+
+EVENTS_DROPPED = "events.dropped"
+# Bounds that keep a running process's message below the channel's 1 MiB: 256 events of 500 characters
+# are 130 kB, 4096 window notices 160 kB. The final message has all returns and windows.
+MAX_EVENTS = 256
+MAX_TEXT = 500
+RECENT_RETURNS = 64
+RECENT_WINDOWS = 4096
+
+LOG_LEVELS: dict[Level, int] = {
+    "DEBUG": logging.DEBUG,
+    "INFO": logging.INFO,
+    "WARN": logging.WARNING,
+    "ERROR": logging.ERROR,
+}
+
+
+class Ledger:
+    """One process's books. Thread-safe, except that a histogram has one thread that records in it.
+
+    Counters only rise; `stats` is a snapshot of everything since the start, so a lost message loses
+    nothing but its events, and those are in the process's log as well.
+    """
+
+    def __init__(self, process: str, incarnation: int) -> None:
+        self._process = process
+        self._incarnation = incarnation
+        self._logger = logging.getLogger(process)
+        self._lock = threading.Lock()
+        self._seq = 0
+        self._counters: Counter[str] = Counter()
+        self._gauges: dict[str, float] = {}
+        self._histograms: dict[str, Histogram] = {}
+        self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self._returns: list[EpisodeReturn] = []
+        self._windows: list[WindowNotice] = []
+
+    def count(self, name: str, n: int = 1) -> None:
+        """Add `n` >= 0 to a counter, which starts at 0: 0.3 us."""
+        if n < 0:
+            raise ValueError(f"{name}: n = {n}: a counter does not fall")
+        with self._lock:
+            self._counters[name] += n
+
+    def set_counter(self, name: str, value: int) -> None:
+        """Take over a count that is kept elsewhere, such as the bus's; it must not fall either."""
+        with self._lock:
+            if value < self._counters[name]:
+                raise ValueError(f"{name}: {value} after {self._counters[name]}: a counter does not fall")
+            self._counters[name] = value
+
+    def counter(self, name: str) -> int:
+        """The counter's value; 0 if nothing was counted."""
+        with self._lock:
+            return self._counters[name]  # a Counter does not keep what it was merely asked for
+
+    def gauge(self, name: str, value: float) -> None:
+        """Set a quantity that goes up and down."""
+        with self._lock:
+            self._gauges[name] = value
+
+    def histogram(self, name: str) -> Histogram:
+        """The histogram of that name, made on first use. Keep it: recording needs no ledger."""
+        with self._lock:
+            return self._histograms.setdefault(name, Histogram())
+
+    def event(self, at_ns: int, level: Level, text: str) -> None:
+        """Put a line on the timeline and into the log.
+
+        Beyond 256 between two snapshots the oldest is dropped and counted as `events.dropped`, and
+        the timeline gets the first 500 characters only; the log has everything.
+        """
+        self._logger.log(LOG_LEVELS[level], "%s", text)
+        with self._lock:
+            if len(self._events) == MAX_EVENTS:
+                self._counters[EVENTS_DROPPED] += 1
+            self._events.append(Event(at_ns=at_ns, level=level, text=text[:MAX_TEXT]))
+
+    def episode(self, episode: EpisodeReturn) -> None:
+        """Add the return of a finished episode."""
+        with self._lock:
+            self._returns.append(episode)
+
+    def windows(self, windows: Sequence[WindowNotice]) -> None:
+        """Replace the phases so far by this list."""
+        with self._lock:
+            self._windows = list(windows)
+
+    def stats(self, at_ns: int, *, final: bool = False) -> Stats:
+        """Everything so far, plus the events since the previous call.
+
+        Returns and windows: the newest 64 and 4096, so that a reader loses none to a lost message;
+        all of them when `final`.
+        """
+        with self._lock:
+            seq, self._seq = self._seq, self._seq + 1
+            events = list(self._events)
+            self._events.clear()
+            return Stats(
+                process=self._process,
+                incarnation=self._incarnation,
+                seq=seq,
+                at_ns=at_ns,
+                final=final,
+                counters=dict(self._counters),
+                gauges=dict(self._gauges),
+                histograms={name: histogram.to_bytes() for name, histogram in self._histograms.items()},
+                events=events,
+                returns=self._returns[0 if final else -RECENT_RETURNS :],
+                windows=self._windows[0 if final else -RECENT_WINDOWS :],
+            )

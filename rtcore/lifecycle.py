@@ -1,0 +1,215 @@
+"""How a process ends in order, and where it writes what it has to say."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType, TracebackType
+
+from rtcore import libc
+
+LEVEL_NAMES = {"WARNING": "WARN", "CRITICAL": "ERROR"}  # as in messages.Level
+
+
+class Stop:
+    """A flag that is set once, from any thread or signal handler, and that can be waited on.
+
+    Not a `threading.Event`: its lock is not re-entrant, so a handler that sets one deadlocks when it
+    interrupts that Event's own `wait` or `set` (seen within 6 s of a signal every 4 ms).
+    `SimpleQueue.put` is re-entrant.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+        self._reason = ""
+        self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+    def set(self, reason: str) -> None:
+        """Stop. Only the first reason is kept."""
+        if not self._is_set:
+            self._reason = reason
+            self._is_set = True
+        self._tokens.put(None)
+
+    def is_set(self) -> bool:
+        """Whether `set` was called."""
+        return self._is_set
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait up to `timeout_s` seconds for the flag; say whether it is set."""
+        if not self._is_set:
+            try:
+                self._tokens.get(timeout=max(0.0, timeout_s))
+            except queue.Empty:
+                return self._is_set
+            self._tokens.put(None)  # for the other waiters
+        return True
+
+    @property
+    def reason(self) -> str:
+        """Why, in a few words; empty while the flag is not set."""
+        return self._reason
+
+
+@contextmanager
+def stop_on_signals(stop: Stop) -> Iterator[None]:
+    """SIGINT and SIGTERM set `stop` inside the block; afterwards the previous handlers are back.
+
+    Main thread only (ValueError elsewhere).
+    """
+
+    def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signal module's signature
+        stop.set(signal.Signals(number).name)
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def die_with_parent(parent_pid: int | None = None) -> bool:
+    """Have the kernel send SIGTERM to this process when its parent ends, even by kill -9.
+
+    Linux only, and "parent" is the thread that started this process: start processes from a thread
+    that lives as long as they should.
+
+    Args:
+        parent_pid: the parent as it was at the start; if it has gone already, SIGTERM comes at once.
+
+    Returns:
+        False where the system does not offer it.
+    """
+    try:
+        libc.prctl(libc.PR_SET_PDEATHSIG, signal.SIGTERM)
+    except OSError:
+        return False
+    if parent_pid is not None and os.getppid() != parent_pid:
+        os.kill(os.getpid(), signal.SIGTERM)
+    return True
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line: ts (UTC), mono_ns, level, process, logger, text and, if any, exception."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = process
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, without its end."""
+        line = {
+            "ts": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "mono_ns": time.monotonic_ns(),
+            "level": LEVEL_NAMES.get(record.levelname, record.levelname),
+            "process": self._process,
+            "logger": record.name,
+            "text": record.getMessage(),
+        }
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line)
+
+
+class LogFile:
+    """What `log_to_file` set up. Leaving the `with` block, or `close`, takes it down again."""
+
+    def __init__(self, handlers: tuple[logging.Handler, ...], previous_level: int) -> None:
+        self._handlers = handlers
+        self._previous_level = previous_level
+
+    def close(self) -> None:
+        """Stop logging there and close the file. A second close does nothing."""
+        root = logging.getLogger()
+        for handler in self._handlers:
+            root.removeHandler(handler)
+            handler.close()
+        if self._handlers:
+            root.setLevel(self._previous_level)
+        self._handlers = ()
+
+    def __enter__(self) -> LogFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def log_to_file(path: Path, process: str, *, level: int = logging.INFO) -> LogFile:
+    """Send the process's log to `path` as JSON lines, and warnings and errors to stderr as well.
+
+    Works from the call on; closing the result is for those who log elsewhere afterwards. The file is
+    appended to, a line at a time, so that the incarnations of one process share it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = logging.FileHandler(path, mode="a", encoding="utf-8")  # flushes after each record
+    lines.setFormatter(JsonLines(process))
+    console = logging.StreamHandler()
+    console.setLevel(logging.WARNING)
+    console.setFormatter(logging.Formatter(f"{process}: %(levelname)s: %(message)s"))
+    root = logging.getLogger()
+    handle = LogFile((lines, console), root.level)
+    root.setLevel(level)
+    root.addHandler(lines)
+    root.addHandler(console)
+    return handle
+
+
+class RateLimited:
+    """Logs at most one line per period; counts the others, and says how many with the next line.
+
+    Thread-safe. Use one per kind of complaint.
+    """
+
+    def __init__(
+        self, logger: logging.Logger, period_s: float, *, now_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._logger = logger
+        self._period_ns = round(period_s * 1e9)
+        self._now_ns = now_ns
+        self._lock = threading.Lock()
+        self._next_ns: int | None = None
+        self._suppressed_since = 0
+        self._suppressed = 0
+
+    @property
+    def suppressed(self) -> int:
+        """Lines not logged so far."""
+        return self._suppressed
+
+    def warning(self, text: str, *arguments: object) -> bool:
+        """Log a warning, or count it; see `log`."""
+        return self.log(logging.WARNING, text, *arguments)
+
+    def error(self, text: str, *arguments: object) -> bool:
+        """Log an error, or count it; see `log`."""
+        return self.log(logging.ERROR, text, *arguments)
+
+    def log(self, level: int, text: str, *arguments: object) -> bool:
+        """Log `text % arguments`, or count it if the last line is less than a period old; say which."""
+        with self._lock:
+            now_ns = self._now_ns()
+            if self._next_ns is not None and now_ns < self._next_ns:
+                self._suppressed_since += 1
+                self._suppressed += 1
+                return False
+            self._next_ns = now_ns + self._period_ns
+            unsaid, self._suppressed_since = self._suppressed_since, 0
+        if unsaid:
+            line = text % arguments if arguments else text
+            self._logger.log(level, "%s (%d more like it were not logged)", line, unsaid)
+        else:
+            self._logger.log(level, text, *arguments)
+        return True

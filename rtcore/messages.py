@@ -1,0 +1,190 @@
+"""Everything that two processes say to each other: one frozen struct per channel.
+
+Encoded as msgpack arrays, so field order is the wire format: new fields go last and have defaults.
+Constraints are checked on decode. Arrays travel as little-endian bytes; their shape and dtype are
+given once, in `Spec`. All `*_ns` stamps are integer nanoseconds of the host's monotonic clock.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Nanos = Annotated[int, msgspec.Meta(ge=0)]
+Index = Annotated[int, msgspec.Meta(ge=-1)]  # -1 means "none"
+
+MissCause = Literal["", "agent_absent", "agent_late", "env_late"]
+Fallback = Literal["", "hold", "neutral"]
+Phase = Literal["update", "hold"]
+Level = Literal["DEBUG", "INFO", "WARN", "ERROR"]
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, array_like=True, forbid_unknown_fields=False):
+    """Base of all messages."""
+
+
+class Spec(Message, frozen=True, kw_only=True):
+    """What an env server declares once per incarnation, before its first tick.
+
+    Observations and actions are float32 vectors; actions are in the environment's own units,
+    within [action_low, action_high].
+    """
+
+    env: str
+    env_id: str
+    incarnation: Nanos  # the env server's start: differs after every restart
+    t0_ns: Nanos  # deadline of tick 0
+    wall_t0_ns: Nanos  # Unix time at t0_ns, for the `wall` timeline alone
+    tick_ns: Annotated[int, msgspec.Meta(gt=0)]
+    unit_ns: Annotated[int, msgspec.Meta(gt=0)]
+    observation_dim: Annotated[int, msgspec.Meta(gt=0)]  # with observed actions included
+    action_dim: Annotated[int, msgspec.Meta(gt=0)]
+    action_low: list[float]
+    action_high: list[float]
+    action_delay_ticks: Count = 0
+    native_period_ns: Count = 0  # simulated time per tick; 0: a world without a simulator
+    scene: str = ""  # how to draw the world: "mujoco" (with `world.mjb` in the run), "point" or ""
+
+
+class Step(Message, frozen=True, kw_only=True):
+    """The world right after tick k, and how that tick came about.
+
+    The tick ran over (D_{k-1}, D_k] under `action`. A reset tick has episode_tick 0, no action, and
+    reward 0. `seq` counts executed ticks without gaps; `tick` skips the deadlines that an overrun lost.
+    """
+
+    env: str
+    incarnation: Nanos
+    seq: Count
+    tick: Count
+    episode: Count
+    episode_tick: Count
+    unit: Count  # t, the paper's unit of time
+    due_ns: Nanos  # D_k
+    woke_ns: Nanos  # when the env server really began the tick
+    sent_ns: Nanos  # when this step was handed to the transport
+    observation: bytes  # float32 [observation_dim]
+    reward: float  # earned over the tick
+    terminated: bool  # the task ended: bootstrap with 0
+    truncated: bool  # only the time limit ended: bootstrap with V(s)
+    action: bytes  # float32 [action_dim], really applied over the tick; empty at a reset
+    decision: bytes  # the action that entered the delay line at D_k; same as `action` without delay
+    answered_tick: Index  # tick of the observation that `decision` answered
+    policy_version: Index  # policy behind `decision`; 0 is the uniformly random pi_0
+    missed: bool  # no answer to observation k-1 at D_k
+    fallback: Fallback  # what acted instead
+    cause: MissCause
+    skipped: Count  # deadlines lost right before this tick
+    loop_ns: Index  # previous step sent -> its answer received here; -1 if none came in time
+    reaction_ns: Index  # the agent's own share of it: observation received -> action sent
+    drift: float  # the true value; for the recorder and regret, never read by agent or learner
+    position: bytes  # float64 simulator qpos (or position), for drawing
+
+
+class StepBatch(Message, frozen=True, kw_only=True):
+    """Consecutive steps of one incarnation, on the lossless path."""
+
+    steps: list[Step]
+    last: bool = False  # the env server ended in order: nothing follows
+
+
+class Action(Message, frozen=True, kw_only=True):
+    """The agent's answer to one observation."""
+
+    env: str
+    incarnation: Nanos  # of the env server that it answers
+    tick: Count  # of the observation that it answers
+    values: bytes  # float32 [action_dim], environment units
+    policy_version: Count  # 0 is the uniformly random pi_0
+    received_ns: Nanos
+    sent_ns: Nanos
+
+
+class Architecture(Message, frozen=True, kw_only=True):
+    """The network behind a policy: a ReLU MLP with two heads, mean and log standard deviation.
+
+    An action in [-1, 1] is tanh(mean + std * noise); the agent scales it to the action space.
+    """
+
+    kind: Literal["tanh_gaussian_mlp"]
+    observation_dim: Annotated[int, msgspec.Meta(gt=0)]
+    action_dim: Annotated[int, msgspec.Meta(gt=0)]
+    hidden: list[int]
+
+
+class Policy(Message, frozen=True, kw_only=True):
+    """One published iterate pi^g of window m."""
+
+    version: Annotated[int, msgspec.Meta(gt=0)]  # rises by one, across restarts
+    window: Count
+    iterate: Count
+    algo: str
+    architecture: Architecture
+    weights: bytes  # safetensors, float32
+    sha256: str  # hex digest of `weights`
+    created_ns: Nanos
+
+
+class WindowNotice(Message, frozen=True, kw_only=True):
+    """The learner entered a phase of window m = [start, start + update + hold) units."""
+
+    window: Count
+    start_unit: Count
+    update_units: Count
+    hold_units: Count | None  # None: held for good
+    phase: Phase
+    at_ns: Nanos  # stamp of the phase's start
+    reason: Literal["schedule", "operator"] = "schedule"
+
+
+class Event(Message, frozen=True, kw_only=True):
+    """A line for people, on the timeline and in the process's log."""
+
+    at_ns: Nanos
+    level: Level
+    text: str
+
+
+class EpisodeReturn(Message, frozen=True, kw_only=True):
+    """Return of one finished episode."""
+
+    episode: Count
+    at_ns: Nanos
+    value: float
+    length: Count
+
+
+class Stats(Message, frozen=True, kw_only=True):
+    """A process's ledger, whole: counters and histograms are cumulative since its start.
+
+    Whoever reads it keeps the newest per (process, incarnation) and adds over incarnations.
+    """
+
+    process: str
+    incarnation: Nanos
+    seq: Count
+    at_ns: Nanos
+    final: bool  # the process ended in order; nothing follows
+    counters: dict[str, int]
+    gauges: dict[str, float]
+    histograms: dict[str, bytes]  # see rtcore.histogram
+    events: list[Event] = []  # since the previous message
+    returns: list[EpisodeReturn] = []  # the newest ones; repeated, so that a lost message loses none
+    windows: list[WindowNotice] = []  # the learner's phases so far
+
+
+class Command(Message, frozen=True, kw_only=True):
+    """An operator's order to one process. Repeating an `id` repeats the reply, not the deed."""
+
+    id: str
+    verb: Literal["hold", "resume", "status", "stop"]
+
+
+class CommandReply(Message, frozen=True, kw_only=True):
+    """The answer to a command."""
+
+    id: str
+    ok: bool
+    text: str

@@ -1,0 +1,139 @@
+"""What the four processes have in common: arguments, placement, bus, ledger, signals, and the end.
+
+    with open_process(channels.AGENT) as process:
+        ...
+
+Leaving the block publishes and writes the process's final stats, whatever happened inside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rtcore import channels, realtime
+from rtcore.bus import Bus
+from rtcore.clock import Clock
+from rtcore.config import RunConfig
+from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop, die_with_parent, log_to_file, stop_on_signals
+from rtcore.messages import Stats
+from rtcore.monotonic import MonotonicClock
+from rtcore.run_dir import RunDir
+from rtcore.zenoh_bus import open_bus
+
+REPORT_PERIOD_S = 0.25  # the rate in the channel table
+
+
+@dataclass(frozen=True)
+class Process:
+    """One process's resources, open for as long as the `with` block runs."""
+
+    config: RunConfig
+    run_dir: RunDir
+    clock: Clock
+    bus: Bus
+    ledger: Ledger
+    stop: Stop
+    incarnation: int  # its start, monotonic ns
+
+
+class Reporter:
+    """Publishes a ledger: a few times a second from a thread, and once more at the end."""
+
+    def __init__(self, ledger: Ledger, bus: Bus, clock: Clock, process: str) -> None:
+        self._ledger = ledger
+        self._bus = bus
+        self._clock = clock
+        self._stats = bus.publisher(channels.STATS, process)
+
+    def report(self, *, final: bool = False) -> Stats:
+        """Publish the ledger as it is, and return what was published."""
+        self._ledger.set_counter("messages.rejected", sum(self._bus.rejected().values()))
+        stats = self._ledger.stats(self._clock.now_ns(), final=final)
+        try:
+            self._stats.put(stats)
+        except ValueError:  # over the channel's size: the final file has it all the same
+            self._ledger.count("stats.oversize")
+        return stats
+
+    def run(self, stop: Stop) -> None:
+        """Publish until stopped."""
+        while not stop.wait(REPORT_PERIOD_S):
+            self.report()
+
+
+def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments that every process takes."""
+    parser = argparse.ArgumentParser(prog=f"python -m {role}", description=f"Tenuto's {role}.")
+    parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="run directory with a run.toml")
+    parser.add_argument("--connect", action="append", default=[], metavar="EP", help="further endpoint to reach")
+    parser.add_argument("--listen", action="append", default=[], metavar="EP", help="further endpoint to offer")
+    parser.add_argument("--supervised", action="store_true", help="end when the parent process ends")
+    return parser.parse_args(argv)
+
+
+@contextmanager
+def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Process]:
+    """Open everything a process needs, and close it in order.
+
+    Raises:
+        ConfigError: the run directory or its configuration is wrong.
+        RealtimeError: `agent.rt = "require"` and the system refuses.
+    """
+    arguments = parse(role, argv)
+    if arguments.supervised:
+        die_with_parent()
+    run_dir = RunDir.open(arguments.run)
+    config = run_dir.config()
+    log_to_file(run_dir.log_path(role), role)
+    placement = realtime.enter(role, config.agent.rt)  # before the bus: its threads inherit it
+    clock = MonotonicClock()
+    incarnation = clock.now_ns()
+    ledger = Ledger(role, incarnation)
+    connect, listen = (*config.link.connect, *arguments.connect), (*config.link.listen, *arguments.listen)
+    stop = Stop()
+    with (
+        stop_on_signals(stop),
+        open_bus(
+            role, run_dir.run_name, run_dir.socket_dir(), clock=clock, connect=connect, listen=listen
+        ) as bus,
+    ):
+        ledger.event(incarnation, "INFO", f"{role}: {placement.describe()}")
+        process = Process(config, run_dir, clock, bus, ledger, stop, incarnation)
+        reporter = Reporter(ledger, bus, clock, role)
+        try:
+            with background(reporter.run, name="reporter"):
+                yield process
+        except Exception as error:
+            logging.getLogger(role).exception("%s failed", role)
+            ledger.event(clock.now_ns(), "ERROR", f"{role} failed: {error}")
+            raise
+        finally:
+            run_dir.write_final_stats(reporter.report(final=True))
+
+
+@contextmanager
+def background(loop: Callable[[Stop], None], *, name: str) -> Iterator[None]:
+    """Run `loop(stop)` on a thread for as long as the block runs, then stop and join it.
+
+    The thread has ordinary scheduling, whatever the process has: it must not delay a tick.
+    """
+    stop = Stop()
+
+    def run() -> None:
+        realtime.step_back()
+        loop(stop)
+
+    thread = threading.Thread(target=run, name=name, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set(f"{name} ends")
+        thread.join(timeout=5.0)

@@ -1,0 +1,289 @@
+"""The bus between processes, over Zenoh. The only file that imports it.
+
+Callbacks run on Zenoh's receiving threads, which carry all topics of a link: they stamp, keep the bytes
+and return.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Generic, Protocol
+
+import zenoh
+from zenoh import ext, handlers
+
+from rtcore.base_bus import BaseBus
+from rtcore.bus import BusClosedError, BusError, Publisher
+from rtcore.channels import ALIVE_KEY, CONTROL_KEY, Channel, Delivery, MessageT
+from rtcore.clock import Clock
+from rtcore.codec import Codec, check_name, key_for
+from rtcore.commands import CommandClient, CommandServer
+from rtcore.inbox import Bell, Inbox, ThreadBell
+from rtcore.messages import Command, CommandReply
+from rtcore.ordering import SourceOrder
+from rtcore.zenoh_config import CLIENT, RUNTIME, session_config
+
+LOSSLESS_CACHE = 2000  # batches a publisher keeps: 100 s at 20 a second
+HEARTBEAT_S = 0.5  # how soon a reader learns that it missed a publisher's last message
+FETCH_TIMEOUT_S = 5.0  # for the history of a publisher met in mid-stream
+RETRY_S = 0.1  # before an unanswered command's second try; the queue of replies may be empty on reconnection
+
+
+def open_bus(
+    role: str,
+    run_name: str,
+    socket_dir: Path,
+    *,
+    clock: Clock,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+) -> ZenohBus:
+    """Join a run. Use it in a `with` block: a process that ends without `close` may hang or abort.
+
+    Returns within half a second, whoever is there; the others are connected to as they come. Zenoh's
+    threads inherit the scheduling of the thread that calls this.
+
+    Args:
+        role: one of `channels.PROCESSES`, or "client".
+        run_name: the run.
+        socket_dir: a directory of mode 0700; every role's socket is in it.
+        clock: gives the stamps of received messages.
+        connect: further endpoints to connect to.
+        listen: further endpoints to listen on.
+
+    Raises:
+        ValueError: an argument that no session can be made of.
+        BusError: Zenoh refuses, as when a process of this role runs already.
+    """
+    settings = session_config(role, run_name, socket_dir, connect=connect, listen=listen)
+    os.putenv("ZENOH_RUNTIME", RUNTIME)  # Zenoh has no other way to set its threads
+    if role != CLIENT:  # errors only and not for commands, because they go to stdout
+        zenoh.init_log_from_env_or("error")
+    try:
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+    except zenoh.ZError as error:
+        raise BusError(
+            f"{role} cannot join the run in {socket_dir} (does it run already?): {error}"
+        ) from error
+    bus = ZenohBus(session, role, clock)
+    bus.watch_alive()
+    return bus
+
+
+class _Sender(Protocol):
+    """A Zenoh publisher, plain or advanced."""
+
+    def put(self, payload: bytes) -> None: ...
+
+
+class _ZenohPublisher(Generic[MessageT]):
+    """Sends on one key; see `rtcore.bus.Publisher`."""
+
+    def __init__(self, codec: Codec[MessageT], sender: _Sender) -> None:
+        self._encode = codec.encode
+        self._sender = sender
+
+    def put(self, message: MessageT) -> None:
+        """Send."""
+        payload = self._encode(message)
+        try:
+            self._sender.put(payload)
+        except zenoh.ZError as error:
+            raise BusClosedError(str(error)) from error
+
+
+class _LosslessFeed:
+    """Hands a lossless channel's samples on in each publisher's order, a late one's history included."""
+
+    def __init__(
+        self, session: zenoh.Session, fits: Callable[[int], bool], inbox: Inbox, clock: Clock
+    ) -> None:
+        self._session = session
+        self._fits = fits
+        self._now_ns = clock.now_ns
+        self._offer = inbox.offer
+        self._order: SourceOrder[tuple[bytes, int]] = SourceOrder(lambda item: inbox.offer(*item))
+
+    def on_sample(self, sample: zenoh.Sample) -> None:
+        """Take a sample from the advanced subscriber, which has put it in order but for late history."""
+        info = sample.source_info
+        item = self._item(sample)
+        if item is None:
+            return
+        if info is None:  # not from a publisher of ours; nothing to put in order
+            self._offer(*item)
+            return
+        source, number = f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
+        if self._order.live(source, number, item):
+            self._fetch(f"{sample.key_expr}/@adv/pub/{source}/**?_sn=0..{number - 1}", source)
+
+    def _item(self, sample: zenoh.Sample) -> tuple[bytes, int] | None:
+        received_ns = self._now_ns()
+        payload = sample.payload
+        return (payload.to_bytes(), received_ns) if self._fits(len(payload)) else None
+
+    def _fetch(self, selector: str, source: str) -> None:
+        """Ask the publisher's cache, under the key by which Zenoh's own history asks."""
+        done = partial(self._order.fetched, source)
+        try:
+            self._session.get(
+                selector,
+                handlers.Callback(partial(self._on_reply, source), done, indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                timeout=FETCH_TIMEOUT_S,
+            )
+        except zenoh.ZError:  # the bus closes
+            done()
+
+    def _on_reply(self, source: str, reply: zenoh.Reply) -> None:
+        sample = reply.ok
+        if sample is not None and sample.source_info is not None:
+            item = self._item(sample)
+            if item is not None:
+                self._order.history(source, sample.source_info.source_sn, item)
+
+
+class ZenohBus(BaseBus):
+    """One process's connection to the run; see `rtcore.bus.Bus`. Made by `open_bus`."""
+
+    def __init__(self, session: zenoh.Session, role: str, clock: Clock) -> None:
+        super().__init__(role, clock)
+        self._session = session
+        self._held: list[object] = []  # Zenoh drops what nobody refers to
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+
+    def publisher(self, channel: Channel[MessageT], name: str = "") -> Publisher[MessageT]:
+        """A publisher; see `rtcore.bus.Bus.publisher`."""
+        self.check_open()
+        sender = self._sender(key_for(channel, name, wildcard=False), channel.delivery)
+        self._held.append(sender)  # with what it keeps for late readers
+        return _ZenohPublisher(Codec(channel, self._rejections), sender)
+
+    def serve(self, name: str, handler: Callable[[Command], CommandReply]) -> None:
+        """Answer commands on a thread of their own; see `rtcore.bus.Bus.serve`."""
+        self.check_open()
+        check_name(name)
+        key = CONTROL_KEY.format(name=name)
+        server = CommandServer(handler, self._rejections)
+
+        def on_query(query: zenoh.Query) -> None:
+            with query:
+                answer = server.answer(b"" if query.payload is None else query.payload.to_bytes())
+                if answer is not None:
+                    query.reply(key, answer)
+
+        self._held.append(self._session.declare_queryable(key, on_query))
+
+    def ask(self, name: str, command: Command, timeout_s: float = 1.0, tries: int = 3) -> CommandReply:
+        """Send a command; see `rtcore.bus.Bus.ask`."""
+        check_name(name)
+        client = CommandClient(command, self._rejections)
+        for attempt in range(tries):
+            if attempt:
+                time.sleep(RETRY_S * attempt)
+            self.check_open()
+            for answer in self._session.get(
+                CONTROL_KEY.format(name=name),
+                payload=client.payload,
+                timeout=timeout_s,
+                target=zenoh.QueryTarget.ALL,
+            ):
+                reply = None if answer.ok is None else client.accept(answer.ok.payload.to_bytes())
+                if reply is not None:
+                    return reply
+        raise client.no_answer(name, timeout_s, tries)
+
+    def declare_alive(self, name: str) -> None:
+        """Let the others see `name`; see `rtcore.bus.Bus.declare_alive`."""
+        self.check_open()
+        check_name(name)
+        self._held.append(self._session.liveliness().declare_token(ALIVE_KEY.format(name=name)))
+
+    def alive(self) -> frozenset[str]:
+        """Who is connected; see `rtcore.bus.Bus.alive`."""
+        self.check_open()
+        with self._lock:
+            return frozenset(self._alive)
+
+    def watch_alive(self) -> None:
+        """Begin to follow who is connected; `open_bus` calls it once."""
+        self._held.append(
+            self._session.liveliness().declare_subscriber(
+                ALIVE_KEY.format(name="*"), handlers.Callback(self._on_alive, indirect=False), history=True
+            )
+        )
+
+    def close(self) -> None:
+        """Leave the run: in milliseconds, or in a second where a stopped process must be given up."""
+        self._closed = True
+        self._session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub has no return type
+
+    def _bell(self) -> Bell:
+        return ThreadBell()
+
+    def _on_alive(self, sample: zenoh.Sample) -> None:
+        name = str(sample.key_expr).rpartition("/")[2]
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._alive.add(name)
+            else:
+                self._alive.discard(name)
+
+    def _sender(self, key: str, delivery: Delivery) -> _Sender:
+        drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
+        if delivery is Delivery.REALTIME:
+            return self._session.declare_publisher(
+                key, congestion_control=drop, priority=zenoh.Priority.REAL_TIME, express=True
+            )
+        if delivery is Delivery.TELEMETRY:
+            return self._session.declare_publisher(key, congestion_control=drop, priority=zenoh.Priority.DATA)
+        if delivery is Delivery.LOSSLESS:
+            depth, every_s, on_change_s = LOSSLESS_CACHE, HEARTBEAT_S, None
+        else:
+            depth, every_s, on_change_s = 1, None, HEARTBEAT_S
+        return ext.declare_advanced_publisher(
+            self._session,
+            key,
+            congestion_control=block,
+            priority=zenoh.Priority.DATA_LOW,
+            cache=ext.CacheConfig(max_samples=depth),
+            publisher_detection=True,
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=every_s, sporadic_heartbeat=on_change_s),
+        )
+
+    def _subscribe(self, key: str, codec: Codec[MessageT], inbox: Inbox, delivery: Delivery) -> None:
+        now_ns, fits, offer = self._clock.now_ns, codec.fits, inbox.offer
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            received_ns = now_ns()
+            payload = sample.payload
+            if fits(len(payload)):
+                offer(payload.to_bytes(), received_ns)
+
+        direct = handlers.Callback(on_sample, indirect=False)
+        if delivery in (Delivery.REALTIME, Delivery.TELEMETRY):
+            self._held.append(self._session.declare_subscriber(key, direct))
+            return
+        depth = 1
+        if delivery is Delivery.LOSSLESS:
+            depth = LOSSLESS_CACHE
+            feed = _LosslessFeed(self._session, fits, inbox, self._clock)
+            direct = handlers.Callback(feed.on_sample, indirect=False)
+        self._held.append(
+            ext.declare_advanced_subscriber(
+                self._session,
+                key,
+                direct,
+                history=ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
+                recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            )
+        )

@@ -1,0 +1,139 @@
+"""The settings of a Zenoh session, as data: one run's peers on one machine, and any further endpoints.
+
+Peers without a router. Every process offers a unix socket in the run's directory and connects to the
+processes that come before it in `channels.PROCESSES`, so that each pair has one link whatever the
+order in which they start. Each constant below carries the measurement (Zenoh 1.10.2, two cores)
+that set it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from rtcore import channels
+
+CLIENT = "client"  # the launcher and its commands: offers nothing, connects to all
+SOCKET_PATH_LIMIT = 107  # bytes of a unix socket's path, by the system
+
+# Worker threads. A reader that stalls while it is sent a history blocks one receiving worker of the
+# publisher's process. With 1 such worker, every healthy replay of 2000 batches delayed the actions by 38
+# ticks of 2 ms and a stopped reader by 960; with 2, two stopped readers by 749; with 4, by 1. The round
+# trip is the same with 1, 2 and 4 (140 to 160 us at 500 Hz). Elsewhere one worker is enough; `net` also
+# reconnects, and a heartbeat may block one of its workers.
+RUNTIME = (
+    "(rx:(worker_threads:4),tx:(worker_threads:1),app:(worker_threads:1),"
+    "net:(worker_threads:2),acc:(worker_threads:1))"
+)
+
+# A process is taken for dead after so long without a sign: longer than any hold of the interpreter lock
+# (an import of torch), which keeps the callbacks waiting.
+LEASE_MS = 3000
+# A put on a LOSSLESS or RETAINED channel waits for a stalled reader so long, then that reader's link is
+# closed, and it recovers from the history once it runs again. It also bounds `close`: with a stopped reader
+# 0.8 s; 4.8 s with the default of 5 s.
+BLOCK_US = 1_000_000
+RETRY_FIRST_MS, RETRY_MOST_MS = 50, 250  # back after a kill -9 within 0.4 s; costs nothing measurable
+OPEN_DELAY_MS = 300  # `open` waits so long at most for processes that are not there yet
+MAX_MESSAGE_BYTES = 64 << 20
+
+
+def socket_path(socket_dir: Path, role: str) -> Path:
+    """Where `role` listens."""
+    return socket_dir / f"{role}.sock"
+
+
+def session_config(
+    role: str, run_name: str, socket_dir: Path, *, connect: Sequence[str] = (), listen: Sequence[str] = ()
+) -> dict[str, object]:
+    """The configuration of one process's session, as Zenoh reads it.
+
+    Args:
+        role: one of `channels.PROCESSES`, or `CLIENT`.
+        run_name: separates the keys of runs that meet on a network.
+        socket_dir: the run's directory for sockets.
+        connect: further endpoints to connect to, such as `tcp/host:7447`.
+        listen: further endpoints to listen on.
+
+    Raises:
+        ValueError: an argument that no session can be made of.
+    """
+    if role not in (*channels.PROCESSES, CLIENT):
+        raise ValueError(f"role = {role!r}: must be one of {', '.join((*channels.PROCESSES, CLIENT))}")
+    if not run_name:
+        raise ValueError("run_name is empty")
+    own, earlier = _own_and_earlier(role)
+    for other in (*own, *earlier):
+        _check_socket_path(socket_path(socket_dir, other))
+    return {
+        "mode": "peer",
+        "namespace": f"tenuto/{quote(run_name, safe='')}",
+        "metadata": {"name": role},
+        "listen": {
+            "endpoints": [*(_endpoint(socket_dir, name) for name in own), *listen],
+            "timeout_ms": 0,
+            "exit_on_failure": True,  # a socket in use: the process runs already
+        },
+        "connect": {
+            "endpoints": [*(_endpoint(socket_dir, name) for name in earlier), *connect],
+            "timeout_ms": -1,  # retry for ever; 0 would mean once
+            "exit_on_failure": False,
+            "retry": {
+                "period_init_ms": RETRY_FIRST_MS,
+                "period_max_ms": RETRY_MOST_MS,
+                "period_increase_factor": 2,
+            },
+        },
+        # Without connect_scouted a restarted reader asks for history before it is connected, and gets none.
+        "open": {"return_conditions": {"connect_scouted": True, "declares": True}},
+        "scouting": {
+            "delay": OPEN_DELAY_MS,
+            "multicast": {"enabled": False},
+            "gossip": {"enabled": False},
+        },
+        "queries_default_timeout": 2000,
+        "transport": _transport(protocols=_protocols((*connect, *listen))),
+    }
+
+
+def _transport(protocols: list[str]) -> dict[str, object]:
+    return {
+        # Chunks in shared memory are dropped silently when a receiver stalls for more than 0.1 s.
+        "shared_memory": {"enabled": False},
+        "unicast": {"open_timeout": 3000, "accept_timeout": 3000},
+        "link": {
+            "protocols": protocols,
+            "tx": {
+                "lease": LEASE_MS,
+                "keep_alive": 4,
+                "queue": {"congestion_control": {"block": {"wait_before_close": BLOCK_US}}},
+            },
+            "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+        },
+    }
+
+
+def _own_and_earlier(role: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    if role == CLIENT:
+        return (), channels.PROCESSES
+    return (role,), channels.PROCESSES[: channels.PROCESSES.index(role)]
+
+
+def _endpoint(socket_dir: Path, role: str) -> str:
+    return f"unixsock-stream/{socket_path(socket_dir, role)}"
+
+
+def _check_socket_path(path: Path) -> None:
+    text = str(path)
+    if len(text.encode()) > SOCKET_PATH_LIMIT:
+        raise ValueError(f"socket path {text} has {len(text.encode())} bytes: at most {SOCKET_PATH_LIMIT}")
+    if set("?#;") & set(text):
+        raise ValueError(f"socket path {text}: must be without any of ? # ;")
+
+
+def _protocols(endpoints: Sequence[str]) -> list[str]:
+    for endpoint in endpoints:
+        if "/" not in endpoint:
+            raise ValueError(f"endpoint {endpoint!r}: must be like tcp/host:port")
+    return sorted({"unixsock-stream", *(endpoint.partition("/")[0] for endpoint in endpoints)})

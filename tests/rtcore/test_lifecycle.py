@@ -1,0 +1,227 @@
+"""Stopping in order, and the log."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from rtcore.clock import VirtualClock
+from rtcore.lifecycle import JsonLines, RateLimited, Stop, die_with_parent, log_to_file, stop_on_signals
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_stop_keeps_its_first_reason() -> None:
+    stop = Stop()
+    assert (stop.is_set(), stop.reason, stop.wait(0.0)) == (False, "", False)
+    stop.set("the duration is over")
+    stop.set("SIGTERM")
+    assert (stop.is_set(), stop.reason, stop.wait(0.0)) == (True, "the duration is over", True)
+    assert stop.wait(-1.0)
+
+
+def test_a_wait_that_nobody_ends_takes_its_time() -> None:
+    began = time.monotonic()
+    assert not Stop().wait(0.02)
+    assert time.monotonic() - began >= 0.019
+
+
+def test_a_stop_wakes_all_who_wait() -> None:
+    stop = Stop()
+    results: list[bool] = []
+    threads = [threading.Thread(target=lambda: results.append(stop.wait(20.0))) for _ in range(5)]
+    for thread in threads:
+        thread.start()
+    began = time.monotonic()
+    stop.set("now")
+    for thread in threads:
+        thread.join()
+    assert results == [True] * 5
+    assert time.monotonic() - began < 10.0
+
+
+def test_signals_that_interrupt_a_stop_at_work_do_not_block_it() -> None:
+    """With a threading.Event inside, two signals that set it while it is being set or waited on deadlock."""
+    code = """
+import signal, time
+from rtcore.lifecycle import Stop
+stop, sets, woken = Stop(), 0, 0
+def handle(number, frame):
+    global sets
+    sets += 1
+    stop.set(f"signal {number}")
+for number in (signal.SIGALRM, signal.SIGPROF):
+    signal.signal(number, handle)
+signal.setitimer(signal.ITIMER_REAL, 0.0002, 0.0001)
+signal.setitimer(signal.ITIMER_PROF, 0.0002, 0.0002)
+end = time.monotonic() + 0.5
+while time.monotonic() < end:
+    stop = Stop()
+    woken += stop.wait(0.00005)
+signal.setitimer(signal.ITIMER_REAL, 0)
+signal.setitimer(signal.ITIMER_PROF, 0)
+print(sets > 100, woken > 10)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=20, check=True
+    )
+    assert done.stdout == "True True\n", done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_set_the_stop_and_the_old_handlers_come_back(number: signal.Signals) -> None:
+    before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM)}
+    stop = Stop()
+    with stop_on_signals(stop):
+        os.kill(os.getpid(), number)
+        assert stop.wait(5.0)
+    assert stop.reason == number.name
+    assert {name: signal.getsignal(name) for name in before} == before
+
+
+def test_handlers_come_back_after_an_error() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyError), stop_on_signals(Stop()):
+        raise KeyError
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+CHILD = """
+import os, sys, time
+from rtcore.lifecycle import Stop, die_with_parent, stop_on_signals
+stop = Stop()
+with stop_on_signals(stop):
+    assert die_with_parent(int(sys.argv[1]) if len(sys.argv) > 1 else None)
+    print(os.getpid(), flush=True)
+    stop.wait(20.0)
+    print(stop.reason, flush=True)
+"""
+PARENT = """
+import subprocess, sys
+subprocess.run([sys.executable, "-c", sys.argv[1]])
+"""
+
+
+def test_a_child_gets_sigterm_when_its_parent_is_killed() -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, CHILD], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    with parent:
+        assert parent.stdout is not None
+        int(parent.stdout.readline())  # the child is set up
+        parent.kill()
+        assert parent.stdout.readline() == "SIGTERM\n"
+
+
+def test_a_parent_that_is_gone_already_counts_as_ended() -> None:
+    nobody = "1" if os.getpid() != 1 else "2"
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, nobody],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=True,
+    )
+    assert done.stdout.splitlines()[1] == "SIGTERM"
+
+
+def test_where_the_kernel_offers_no_such_thing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rtcore.libc._prctl", None)
+    assert not die_with_parent()
+
+
+def lines(path: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_the_log_is_json_lines_and_warnings_reach_stderr(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "logs" / "learner.jsonl"
+    before_ns = time.monotonic_ns()
+    with log_to_file(path, "learner"):
+        logging.getLogger("learner.replay").info("took %d steps", 3)
+        assert lines(path)[0]["text"] == "took 3 steps"  # written at once
+        logging.getLogger("learner").debug("nobody asked")
+        logging.getLogger("learner").warning("two\nlines")
+    first, second = lines(path)
+    assert list(first) == ["ts", "mono_ns", "level", "process", "logger", "text"]
+    assert (first["level"], first["process"], first["logger"]) == ("INFO", "learner", "learner.replay")
+    assert (second["level"], second["text"]) == ("WARN", "two\nlines")
+    assert datetime.fromisoformat(str(first["ts"])).utcoffset() == timedelta(0)
+    assert isinstance(first["mono_ns"], int)
+    assert before_ns <= first["mono_ns"] <= time.monotonic_ns()
+    captured = capsys.readouterr().err
+    assert "learner: WARNING: two" in captured
+    assert "steps" not in captured
+
+
+def test_text_that_no_encoding_takes_is_logged_all_the_same() -> None:
+    record = logging.LogRecord("x", logging.CRITICAL, "x.py", 1, "file \udcff of %s", ("a",), None)
+    line = json.loads(JsonLines("recorder").format(record).encode("ascii"))
+    assert (line["text"], line["level"], line["process"]) == ("file \udcff of a", "ERROR", "recorder")
+
+
+def test_the_log_tells_exceptions_and_is_appended_to(tmp_path: Path) -> None:
+    path = tmp_path / "env_server.jsonl"
+    for _ in range(2):
+        with log_to_file(path, "env_server"):
+            try:
+                raise KeyError("scale")
+            except KeyError:
+                logging.getLogger("env_server").exception("env_server failed")
+    assert [line["text"] for line in lines(path)] == ["env_server failed"] * 2
+    exception = str(lines(path)[0]["exception"])
+    assert exception.startswith("Traceback")
+    assert exception.endswith("KeyError: 'scale'")
+
+
+def test_closing_the_log_leaves_logging_as_it_was(tmp_path: Path) -> None:
+    root = logging.getLogger()
+    before = (root.level, list(root.handlers))
+    handle = log_to_file(tmp_path / "x.jsonl", "x", level=logging.DEBUG)
+    assert root.level == logging.DEBUG
+    handle.close()
+    handle.close()
+    assert (root.level, root.handlers) == before
+
+
+def test_rate_limited_logs_one_line_per_period_and_counts_the_rest(caplog: pytest.LogCaptureFixture) -> None:
+    clock = VirtualClock()
+    limited = RateLimited(logging.getLogger("bus"), 2.0, now_ns=clock.now_ns)
+    logged = []
+    for _ in range(5):  # at 0, 0.9, 1.8, 2.7, 3.6 s
+        logged.append(limited.warning("bad message on %s", "step"))
+        clock.advance_ns(900_000_000)
+    clock.advance_ns(200_000_000)  # 4.7 s: a period after 2.7 s
+    logged.append(limited.error("100% bad"))
+    assert logged == [True, False, False, True, False, True]
+    assert [record.getMessage() for record in caplog.records] == [
+        "bad message on step",
+        "bad message on step (2 more like it were not logged)",
+        "100% bad (1 more like it were not logged)",
+    ]
+    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING", "ERROR"]
+    assert limited.suppressed == 3
+
+
+def test_rate_limited_lets_a_line_through_exactly_one_period_later(caplog: pytest.LogCaptureFixture) -> None:
+    clock = VirtualClock()
+    limited = RateLimited(logging.getLogger("bus"), 2.0, now_ns=clock.now_ns)
+    assert limited.warning("50% bad")
+    clock.advance_ns(1_999_999_999)
+    assert not limited.warning("50% bad")
+    clock.advance_ns(1)
+    assert limited.warning("50% bad")
+    assert caplog.records[0].getMessage() == "50% bad"

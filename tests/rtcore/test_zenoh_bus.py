@@ -1,0 +1,298 @@
+"""What only real processes and real sockets show."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcore.bus import BusError
+from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, SPEC, STEP
+from rtcore.monotonic import MonotonicClock
+from rtcore.zenoh_bus import open_bus
+from rtcore.zenoh_config import session_config, socket_path
+from tests.rtcore.bus_child import BATCHES
+from tests.rtcore.bus_samples import ENV, ZenohWorld, batch, collect, eventually, policy, spec, step
+
+ROOT = Path(__file__).parents[2]
+CLOCK = MonotonicClock()
+
+Child = subprocess.Popen[str]
+Spawn = Callable[..., Child]
+
+
+@pytest.fixture
+def world() -> Iterator[ZenohWorld]:
+    with tempfile.TemporaryDirectory(prefix="tn", dir="/tmp") as directory:
+        zenoh_world = ZenohWorld(Path(directory))
+        yield zenoh_world
+        zenoh_world.close()
+
+
+@pytest.fixture
+def spawn(world: ZenohWorld) -> Iterator[Spawn]:
+    """Start a child and wait until it is connected."""
+    children: list[Child] = []
+
+    def start(deed: str, role: str, *arguments: str) -> Child:
+        command = [
+            sys.executable,
+            "-m",
+            "tests.rtcore.bus_child",
+            deed,
+            role,
+            str(world.socket_dir),
+            *arguments,
+        ]
+        child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        children.append(child)
+        return child
+
+    yield start
+    for child in children:
+        child.kill()
+        child.communicate()
+
+
+def ready(child: Child) -> Child:
+    assert child.stdout is not None
+    assert child.stdout.readline() == "ready\n"
+    return child
+
+
+def numbers_of(incarnation: int) -> list[int]:
+    return list(range(incarnation * 1000, incarnation * 1000 + BATCHES))
+
+
+def test_a_killed_publisher_comes_back_and_nothing_it_sent_then_is_lost(
+    world: ZenohWorld, spawn: Spawn
+) -> None:
+    recorder = world.bus(RECORDER)
+    batches, specs = recorder.queue(LOG, ENV), recorder.latest(SPEC, ENV)
+    env = ready(spawn("publish", ENV_SERVER, "1"))
+    assert collect(batches, until=1399) == numbers_of(1)
+    assert specs.take() is not None
+    assert eventually(lambda: ENV_SERVER in recorder.alive())
+    env.kill()  # SIGKILL: its socket file stays
+    env.wait()
+    assert eventually(lambda: ENV_SERVER not in recorder.alive())
+    assert socket_path(world.socket_dir, ENV_SERVER).exists()
+    ready(spawn("publish", ENV_SERVER, "2"))
+    assert collect(batches, until=2399) == numbers_of(2)
+    assert specs.wait(5.0) is not None
+    assert eventually(lambda: ENV_SERVER in recorder.alive())
+
+
+def test_a_killed_reader_comes_back_and_gets_everything(world: ZenohWorld, spawn: Spawn) -> None:
+    publisher = world.bus(ENV_SERVER).publisher(LOG, ENV)
+    first = ready(spawn("read", RECORDER))
+    for seq in range(200):
+        publisher.put(batch(seq))
+    assert first.stdout is not None
+    assert [int(first.stdout.readline()) for _ in range(200)] == list(range(200))
+    first.kill()
+    first.wait()
+    for seq in range(200, 400):
+        publisher.put(batch(seq))
+    second = ready(spawn("read", RECORDER))
+    for seq in range(400, 600):
+        publisher.put(batch(seq))
+    assert second.stdout is not None
+    assert [int(second.stdout.readline()) for _ in range(600)] == list(range(600))
+
+
+def test_a_reader_stopped_beyond_the_lease_gets_everything_afterwards(
+    world: ZenohWorld, spawn: Spawn
+) -> None:
+    publisher = world.bus(ENV_SERVER).publisher(LOG, ENV)
+    reader = ready(spawn("read", RECORDER))
+    assert reader.stdout is not None
+    publisher.put(batch(0))
+    assert int(reader.stdout.readline()) == 0
+    reader.send_signal(signal.SIGSTOP)
+    for seq in range(1, 41):  # 4 s; the lease is 3 s
+        publisher.put(batch(seq))
+        time.sleep(0.1)
+    reader.send_signal(signal.SIGCONT)
+    for seq in range(41, 60):
+        publisher.put(batch(seq))
+        time.sleep(0.02)
+    assert [int(reader.stdout.readline()) for _ in range(59)] == list(range(1, 60))
+
+
+def test_readers_stopped_while_they_get_a_history_do_not_delay_the_actions(
+    world: ZenohWorld, spawn: Spawn
+) -> None:
+    env = world.bus(ENV_SERVER)
+    steps, actions = env.publisher(STEP, ENV), env.latest(ACTION, ENV)
+    log = env.publisher(LOG, ENV)
+    big = batch(0).steps * 50
+    for _ in range(1000):
+        log.put(type(batch(0))(steps=big))  # 15 MB of history: far more than the sockets hold
+    ready(spawn("answer", AGENT))
+    assert eventually(lambda: steps.put(step(0)) is None and actions.wait(0.1) is not None)  # type: ignore[func-returns-value]
+    for role in (LEARNER, RECORDER):
+        reader = ready(spawn("read", role))
+        reader.send_signal(signal.SIGSTOP)
+    answered = 0
+    for seq in range(300):  # 0.6 s: less than BLOCK_US, so that the links are not given up yet
+        steps.put(step(seq))
+        received = actions.wait(0.002)
+        answered += received is not None
+    # With one receiving worker: 0 answered.
+    assert answered > 200
+
+
+def test_a_stopped_reader_and_a_blocked_put_do_not_delay_the_end(world: ZenohWorld, spawn: Spawn) -> None:
+    env = world.bus(ENV_SERVER)
+    log = env.publisher(LOG, ENV)
+    reader = ready(spawn("read", RECORDER))
+    log.put(batch(0))
+    assert reader.stdout is not None
+    assert int(reader.stdout.readline()) == 0
+    reader.send_signal(signal.SIGSTOP)
+    put_ns = [time.monotonic_ns()]
+    ended: list[BaseException] = []
+
+    def flood() -> None:
+        big = type(batch(0))(steps=batch(0).steps * 200)
+        try:
+            while True:
+                log.put(big)
+                put_ns[0] = time.monotonic_ns()
+        except BusError as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    assert eventually(lambda: time.monotonic_ns() - put_ns[0] > 300_000_000)  # it blocks
+    begin = time.monotonic()
+    env.close()
+    assert time.monotonic() - begin < 2.0
+    thread.join(2.0)
+    assert ended
+
+
+@pytest.mark.parametrize(("deed", "code"), [("leave", 0), ("fail", 1)])
+def test_a_process_ends_at_once_and_says_nothing_of_its_own(
+    world: ZenohWorld, spawn: Spawn, deed: str, code: int
+) -> None:
+    world.bus(ENV_SERVER)  # somebody to connect to
+    child = spawn(deed, AGENT)
+    begin = time.monotonic()
+    output, errors = child.communicate(timeout=20.0)
+    assert time.monotonic() - begin < 10.0
+    assert child.returncode == code
+    assert output == ("4\n" if deed == "leave" else "")  # the receiving workers of zenoh_config.RUNTIME
+    assert ("on purpose" in errors) == (deed == "fail")
+    assert "zenoh" not in errors.replace("zenoh_bus", "")
+
+
+def test_a_role_runs_once(world: ZenohWorld) -> None:
+    world.bus(AGENT)
+    with pytest.raises(BusError, match=r"agent_service cannot join the run in .*does it run already"):
+        world.bus(AGENT)
+
+
+@pytest.mark.parametrize("role", [ENV_SERVER, RECORDER, "client"])
+def test_opening_does_not_wait_for_the_others(world: ZenohWorld, role: str) -> None:
+    begin = time.monotonic()
+    world.bus(role)
+    assert time.monotonic() - begin < 1.0
+
+
+def test_further_endpoints_connect_what_shares_no_directory(world: ZenohWorld) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    elsewhere = world.socket_dir / "b"
+    elsewhere.mkdir(0o700)
+    with (
+        open_bus(LEARNER, "run", world.socket_dir, clock=CLOCK, listen=[endpoint]) as learner,
+        open_bus(AGENT, "run", elsewhere, clock=CLOCK, connect=[endpoint]) as agent,
+        open_bus(RECORDER, "other", elsewhere, clock=CLOCK, connect=[endpoint]) as stranger,
+    ):
+        learner.publisher(POLICY).put(policy(5))
+        policies, foreign = agent.latest(POLICY), stranger.latest(POLICY)
+        received = policies.wait(5.0)
+        assert received is not None and received.message.version == 5
+        assert foreign.wait(0.3) is None  # the run's name is in the keys
+
+
+def test_a_socket_left_behind_is_taken_over(world: ZenohWorld) -> None:
+    with world.bus(ENV_SERVER) as first:
+        first.publisher(SPEC, ENV).put(spec())
+    with world.bus(ENV_SERVER) as second:
+        second.publisher(SPEC, ENV).put(spec())
+        assert world.bus(AGENT).latest(SPEC, ENV).wait(5.0) is not None
+
+
+def test_settings_that_no_session_can_be_made_of() -> None:
+    with pytest.raises(ValueError, match=r"role = 'actor': must be one of env_server, agent_service"):
+        session_config("actor", "run", Path("/tmp"))
+    with pytest.raises(ValueError, match="run_name is empty"):
+        session_config(AGENT, "", Path("/tmp"))
+    with pytest.raises(ValueError, match=r"has 12\d bytes: at most 107"):
+        session_config(AGENT, "run", Path("/tmp") / ("d" * 100))
+    with pytest.raises(ValueError, match="without any of"):
+        session_config(AGENT, "run", Path("/tmp/a#b"))
+    with pytest.raises(ValueError, match="endpoint 'localhost:7447': must be like tcp/host:port"):
+        session_config(AGENT, "run", Path("/tmp"), connect=["localhost:7447"])
+
+
+def test_each_role_connects_to_the_earlier_ones() -> None:
+    def endpoints(role: str, key: str) -> list[str]:
+        section = session_config(role, "run", Path("/s"))[key]
+        assert isinstance(section, dict)
+        return [endpoint.removeprefix("unixsock-stream//s/") for endpoint in section["endpoints"]]
+
+    roles = (ENV_SERVER, AGENT, LEARNER, RECORDER, "client")
+    assert [endpoints(role, "listen") for role in roles] == [
+        ["env_server.sock"],
+        ["agent_service.sock"],
+        ["learner.sock"],
+        ["recorder.sock"],
+        [],
+    ]
+    assert [len(endpoints(role, "connect")) for role in roles] == [0, 1, 2, 3, 4]
+    assert endpoints(LEARNER, "connect") == ["env_server.sock", "agent_service.sock"]
+
+
+def test_protocols_are_those_of_the_endpoints() -> None:
+    config = session_config(
+        AGENT, "a b", Path("/s"), connect=["tcp/h:1", "tls/h:2"], listen=["tcp/0.0.0.0:3"]
+    )
+    transport = config["transport"]
+    assert isinstance(transport, dict)
+    assert transport["link"]["protocols"] == ["tcp", "tls", "unixsock-stream"]
+    assert config["namespace"] == "tenuto/a%20b"
+
+
+def test_a_signal_handler_ends_a_wait(world: ZenohWorld) -> None:
+    class InterruptedWaitError(Exception):
+        pass
+
+    def handle(number: int, frame: object) -> None:
+        raise InterruptedWaitError
+
+    previous = signal.signal(signal.SIGUSR1, handle)
+    latest = world.bus(AGENT).latest(STEP, ENV)
+    timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGUSR1))
+    begin = time.monotonic()
+    try:
+        timer.start()
+        with pytest.raises(InterruptedWaitError):
+            latest.wait(20.0)
+    finally:
+        timer.join()
+        signal.signal(signal.SIGUSR1, previous)
+    assert time.monotonic() - begin < 2.0
