@@ -1,0 +1,1 @@
+"""The world and its clock: the one process that sleeps towards deadlines."""

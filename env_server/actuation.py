@@ -1,0 +1,205 @@
+"""What acts at a deadline: the answer that came in time, or the declared fallback. Pure.
+
+At D_k the answer to the newest observation (that of the tick executed before) becomes the decision;
+without one the tick is a miss and the fallback decides. The decision enters a delay line and acts
+`action_delay_ticks` ticks later, at once without delay. Older answers never act.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from env_server.world import Vector, World
+from rtcore.config import EnvConfig, MissPolicy
+from rtcore.messages import Action, Fallback, MissCause
+
+Verdict = Literal["none", "answer", "stale", "invalid"]
+
+_ABSENT_NS = 1_000_000_000  # silent for longer than this, the agent counts as absent rather than late
+_CLIP_TOLERANCE = 1e-6  # of the range: what float32 scaling of [-1, 1] may overshoot without being a fault
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """What `Actuation` obeys; the first four fields are those of `EnvConfig`."""
+
+    on_miss: MissPolicy
+    hold_ticks: int
+    action_delay_ticks: int
+    observe_actions: int
+    low: Vector
+    high: Vector
+    tick_ns: int
+    incarnation: int
+
+    @staticmethod
+    def of(env: EnvConfig, world: World, *, tick_ns: int, incarnation: int) -> Rules:
+        """The rules of one environment."""
+        return Rules(
+            on_miss=env.on_miss,
+            hold_ticks=env.hold_ticks,
+            action_delay_ticks=env.action_delay_ticks,
+            observe_actions=env.observe_actions,
+            low=world.action_low,
+            high=world.action_high,
+            tick_ns=tick_ns,
+            incarnation=incarnation,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One deadline's result.
+
+    Attributes:
+        applied: float32 [action_dim], read-only, acts over the tick.
+        decided: float32 [action_dim], read-only, enters the delay line; the same as `applied` without delay.
+        missed: no answer to the newest observation came.
+        fallback: what decided instead of an answer; "" if not missed.
+        cause: of the miss.
+        policy_version: behind `decided`; -1 for the neutral action.
+        answered_tick: tick of the observation that `decided` answered; -1 for the neutral action.
+        verdict: what became of the newest message.
+        clipped: the answer lay outside the bounds.
+    """
+
+    applied: Vector
+    decided: Vector
+    missed: bool
+    fallback: Fallback
+    cause: MissCause
+    policy_version: int
+    answered_tick: int
+    verdict: Verdict
+    clipped: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """A decision's values and where they come from."""
+
+    values: Vector
+    policy_version: int
+    answered_tick: int
+
+
+class Actuation:
+    """Decides tick by tick. Remembers the last decisions of the episode and when the agent was last heard."""
+
+    def __init__(self, rules: Rules) -> None:
+        self._rules = rules
+        neutral = np.clip(np.zeros_like(rules.low), rules.low, rules.high)
+        neutral.setflags(write=False)  # decisions are shared: by hold, delay line and observed actions
+        self._neutral = _Choice(neutral, -1, -1)
+        self._absent_ticks = max(1, math.ceil(_ABSENT_NS / rules.tick_ns))
+        self._silent_ticks: int | None = None  # since the last message; None: there was none yet
+        self._held: _Choice | None = None
+        self._missed_in_a_row = 0
+        self._line: deque[Vector] = deque()
+        self._past: deque[Vector] = deque()
+        self._start()
+
+    def reset(self, newest: Action | None) -> Verdict:
+        """Begin an episode at this tick: neutral actions in the delay line, nothing to hold.
+
+        Args:
+            newest: the message that came since the tick before, if any; it has nothing to act on.
+
+        Returns:
+            "answer" or "none": an answer to the episode's last observation is nobody's fault.
+        """
+        self._listen(newest)
+        self._start()
+        return "none" if newest is None else "answer"
+
+    def decide(self, newest: Action | None, *, expected_tick: int, answer_time_ns: int) -> Decision:
+        """The deadline of one tick that is no reset.
+
+        Args:
+            newest: the newest message that came since the tick before, if any.
+            expected_tick: the tick executed before this one, whose observation is to be answered.
+            answer_time_ns: from sending that observation to this wake-up, the time the agent had.
+        """
+        self._listen(newest)
+        verdict, answer, clipped = self._judge(newest, expected_tick)
+        fallback: Fallback = ""
+        cause: MissCause = ""
+        if answer is not None:
+            self._held, self._missed_in_a_row = answer, 0
+            choice = answer
+        else:
+            fallback, choice = self._fall_back()
+            cause = self._cause(answer_time_ns)
+            self._missed_in_a_row += 1
+        self._line.append(choice.values)
+        if self._past:
+            self._past.appendleft(choice.values)
+        return Decision(
+            applied=self._line.popleft(),
+            decided=choice.values,
+            missed=answer is None,
+            fallback=fallback,
+            cause=cause,
+            policy_version=choice.policy_version,
+            answered_tick=choice.answered_tick,
+            verdict=verdict,
+            clipped=clipped,
+        )
+
+    def observed(self, observation: Vector) -> Vector:
+        """`observation` followed by the last `observe_actions` decisions, newest first; neutral ones before
+        the episode's first.
+
+        Returns:
+            float32 [observation_dim + observe_actions * action_dim].
+        """
+        return np.concatenate((observation, *self._past)) if self._past else observation
+
+    def _start(self) -> None:
+        rules, neutral = self._rules, self._neutral.values
+        self._held = None
+        self._missed_in_a_row = 0
+        self._line = deque([neutral] * rules.action_delay_ticks)
+        self._past = deque([neutral] * rules.observe_actions, maxlen=rules.observe_actions)
+
+    def _listen(self, newest: Action | None) -> None:
+        if newest is not None:
+            self._silent_ticks = 0
+        elif self._silent_ticks is not None:
+            self._silent_ticks += 1
+
+    def _judge(self, newest: Action | None, expected_tick: int) -> tuple[Verdict, _Choice | None, bool]:
+        """What the message is, the choice it makes if it is the answer, and whether it had to be clipped."""
+        rules = self._rules
+        if newest is None:
+            return "none", None, False
+        if newest.incarnation != rules.incarnation or newest.tick < expected_tick:
+            return "stale", None, False
+        if newest.tick > expected_tick or len(newest.values) != rules.low.nbytes:
+            return "invalid", None, False
+        wanted = np.frombuffer(newest.values, "<f4").astype(np.float32)
+        if not np.isfinite(wanted).all():
+            return "invalid", None, False
+        values = np.clip(wanted, rules.low, rules.high)
+        values.setflags(write=False)
+        clipped = bool((np.abs(wanted - values) > _CLIP_TOLERANCE * (rules.high - rules.low)).any())
+        return "answer", _Choice(values, newest.policy_version, newest.tick), clipped
+
+    def _fall_back(self) -> tuple[Fallback, _Choice]:
+        rules = self._rules
+        run_out = rules.on_miss == "hold_then_neutral" and self._missed_in_a_row >= rules.hold_ticks
+        if rules.on_miss == "neutral" or run_out or self._held is None:
+            return "neutral", self._neutral
+        return "hold", self._held
+
+    def _cause(self, answer_time_ns: int) -> MissCause:
+        if self._silent_ticks is None or self._silent_ticks > self._absent_ticks:
+            return "agent_absent"
+        if 2 * answer_time_ns < self._rules.tick_ns:
+            return "env_late"  # the observation left so late that the agent had less than half a period
+        return "agent_late"

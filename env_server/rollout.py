@@ -1,0 +1,119 @@
+"""Episodes: from an action in time, or none, to what the world did with the tick. Pure but for the world.
+
+An episode ends when the world says so or after H ticks. The tick after the last is a reset tick: no
+transition, no action, no miss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from env_server.actuation import Actuation, Decision, Verdict
+from env_server.world import Outcome, Vector, World
+from rtcore.messages import Action
+
+WORLD_STREAM = 0  # keeps the world's random numbers apart from the agent's and the learner's
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """What one tick came to.
+
+    Attributes:
+        observation: float32 [observation_dim], observed actions included.
+        reward: earned over the tick; 0 at a reset.
+        terminated: the task ended.
+        truncated: only the time limit, or a broken world, ended the episode.
+        drift: the drift's true value.
+        episode: index, from 0.
+        episode_tick: ticks since the reset, 0 at it.
+        verdict: what became of the newest message.
+        decision: None at a reset.
+        episode_return: sum of rewards if the episode ended here, else None.
+        broken: the world gave NaN or Inf; observation and reward were replaced.
+    """
+
+    observation: Vector
+    reward: float
+    terminated: bool
+    truncated: bool
+    drift: float
+    episode: int
+    episode_tick: int
+    verdict: Verdict
+    decision: Decision | None
+    episode_return: float | None
+    broken: bool
+
+
+class Rollout:
+    """Turns a world through its episodes, tick by tick."""
+
+    def __init__(self, world: World, actuation: Actuation, *, episode_steps: int, seed: int) -> None:
+        self._world = world
+        self._actuation = actuation
+        self._episode_steps = episode_steps
+        self._seed = seed
+        self._episode = -1
+        self._episode_tick = 0
+        self._return = 0.0
+        self._ended = True
+        self._last_good: Vector = np.zeros(world.observation_dim, np.float32)
+
+    def turn(self, newest: Action | None, t: int, *, expected_tick: int, answer_time_ns: int) -> Turn:
+        """One tick in unit `t`: a reset if the episode has ended, else a step. See `Actuation.decide`."""
+        if self._ended:
+            return self._reset(newest, t)
+        decision = self._actuation.decide(newest, expected_tick=expected_tick, answer_time_ns=answer_time_ns)
+        outcome = self._world.step(decision.applied, t)
+        broken = not (np.isfinite(outcome.observation).all() and np.isfinite(outcome.reward))
+        if broken:  # it must not reach anybody's replay: the state before again, and a new episode
+            outcome = Outcome(
+                self._last_good, 0.0, terminated=False, truncated=True, drift=self._world.drift(t)
+            )
+        self._last_good = outcome.observation
+        self._episode_tick += 1
+        self._return += outcome.reward
+        over = outcome.truncated or self._episode_tick >= self._episode_steps
+        self._ended = outcome.terminated or over
+        return Turn(
+            observation=self._actuation.observed(outcome.observation),
+            reward=outcome.reward,
+            terminated=outcome.terminated,
+            truncated=over and not outcome.terminated,
+            drift=outcome.drift,
+            episode=self._episode,
+            episode_tick=self._episode_tick,
+            verdict=decision.verdict,
+            decision=decision,
+            episode_return=self._return if self._ended else None,
+            broken=broken,
+        )
+
+    def _reset(self, newest: Action | None, t: int) -> Turn:
+        """Begin an episode whose start follows from the run's seed and the episode's index alone."""
+        self._episode += 1
+        self._episode_tick = 0
+        self._return = 0.0
+        seeds = np.random.SeedSequence([self._seed, WORLD_STREAM, self._episode])
+        observation = self._world.reset(int(seeds.generate_state(1)[0]), t)
+        verdict = self._actuation.reset(newest)
+        self._ended = broken = not np.isfinite(observation).all()
+        if broken:
+            observation = np.zeros_like(observation)
+        self._last_good = observation
+        return Turn(
+            observation=self._actuation.observed(observation),
+            reward=0.0,
+            terminated=False,
+            truncated=False,
+            drift=self._world.drift(t),
+            episode=self._episode,
+            episode_tick=0,
+            verdict=verdict,
+            decision=None,
+            episode_return=None,
+            broken=broken,
+        )

@@ -1,0 +1,86 @@
+"""How the env server puts things into messages. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from env_server.accounts import Latency
+from env_server.rollout import Turn
+from env_server.world import Position, World
+from rtcore.config import EnvConfig
+from rtcore.messages import Spec, Step
+from rtcore.pacer import Tick
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """Whose step it is, and which: the fields of `Step` of these names."""
+
+    env: str
+    incarnation: int
+    seq: int
+    unit: int
+    sent_ns: int
+
+
+def word_spec(
+    env: EnvConfig, world: World, *, incarnation: int, t0_ns: int, wall_t0_ns: int, tick_ns: int
+) -> Spec:
+    """The declaration of a resolved `env`."""
+    simulated_s = 0.0 if env.speed is None else env.speed * tick_ns / 1e9
+    return Spec(
+        env=env.name,
+        env_id=env.id,
+        incarnation=incarnation,
+        t0_ns=t0_ns,
+        wall_t0_ns=wall_t0_ns,
+        tick_ns=tick_ns,
+        unit_ns=unit_ns(env),
+        observation_dim=world.observation_dim + env.observe_actions * world.action_dim,
+        action_dim=world.action_dim,
+        action_low=world.action_low.tolist(),
+        action_high=world.action_high.tolist(),
+        action_delay_ticks=env.action_delay_ticks,
+        native_period_ns=round(simulated_s * 1e9),
+        scene=world.scene,
+    )
+
+
+def word_step(stamp: Stamp, tick: Tick, turn: Turn, latency: Latency, position: Position) -> Step:
+    """The report of one executed tick; `latency` is told only when the answer came in time."""
+    if turn.verdict != "answer":
+        latency = Latency()
+    decision = turn.decision
+    return Step(
+        env=stamp.env,
+        incarnation=stamp.incarnation,
+        seq=stamp.seq,
+        tick=tick.index,
+        episode=turn.episode,
+        episode_tick=turn.episode_tick,
+        unit=stamp.unit,
+        due_ns=tick.due_ns,
+        woke_ns=tick.woke_ns,
+        sent_ns=stamp.sent_ns,
+        observation=turn.observation.astype("<f4").tobytes(),
+        reward=turn.reward,
+        terminated=turn.terminated,
+        truncated=turn.truncated,
+        action=b"" if decision is None else decision.applied.astype("<f4").tobytes(),
+        decision=b"" if decision is None else decision.decided.astype("<f4").tobytes(),
+        answered_tick=-1 if decision is None else decision.answered_tick,
+        policy_version=-1 if decision is None else decision.policy_version,
+        missed=decision is not None and decision.missed,
+        fallback="" if decision is None else decision.fallback,
+        cause="" if decision is None else decision.cause,
+        skipped=tick.skipped,
+        loop_ns=latency.loop_ns,
+        reaction_ns=latency.reaction_ns,
+        drift=turn.drift,
+        position=position.astype("<f8").tobytes(),
+    )
+
+
+def unit_ns(env: EnvConfig) -> int:
+    """The length of a unit t."""
+    return round(env.unit_s * 1e9)
