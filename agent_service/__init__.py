@@ -1,0 +1,1 @@
+"""The actor: newest observation in, action out, before the deadline."""

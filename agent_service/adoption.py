@@ -1,0 +1,64 @@
+"""Which policy acts next: checks what arrives, keeps the newest good one ready for the swap.
+
+Runs beside acting, never in it: the acting thread only takes a reference (`take`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from agent_service.inference import Array, TanhGaussianPolicy
+from rtcore.ledger import Ledger
+from rtcore.messages import Policy, Spec
+from rtcore.weights import WeightsError, verify
+
+
+class Adoption:
+    """Candidates for the swap. One thread offers, one takes.
+
+    Counts `policies.received`, `.rejected` and `.superseded` (replaced by a newer one before it acted);
+    a repeat of the newest version, which a late or reconnected reader gets, counts as `.repeated` alone.
+    """
+
+    def __init__(self, spec: Spec, ledger: Ledger) -> None:
+        self._spec = spec
+        self._ledger = ledger
+        self._low: Array = np.asarray(spec.action_low, np.float32)
+        self._high: Array = np.asarray(spec.action_high, np.float32)
+        self._newest_version = 0
+        # One place; pop and append are atomic, so the two threads need no lock.
+        self._ready: deque[tuple[TanhGaussianPolicy, Policy]] = deque()
+
+    def offer(self, policy: Policy, now_ns: int) -> None:
+        """Check a policy and make it ready; a bad one is refused, counted and reported."""
+        if policy.version == self._newest_version:
+            self._ledger.count("policies.repeated")
+            return
+        self._ledger.count("policies.received")
+        try:
+            ready = self._prepare(policy)
+        except WeightsError as error:
+            self._ledger.count("policies.rejected")
+            self._ledger.event(now_ns, "WARN", f"policy {policy.version} refused: {error}")
+            return
+        self._newest_version = policy.version
+        if self.take() is not None:
+            self._ledger.count("policies.superseded")
+        self._ready.append((ready, policy))
+
+    def take(self) -> tuple[TanhGaussianPolicy, Policy] | None:
+        """The policy that is ready for the swap, once."""
+        try:
+            return self._ready.pop()
+        except IndexError:
+            return None
+
+    def _prepare(self, policy: Policy) -> TanhGaussianPolicy:
+        if policy.version < self._newest_version:
+            raise WeightsError(f"version {self._newest_version} was there before")
+        arrays = verify(policy, self._spec.observation_dim, self._spec.action_dim)
+        ready = TanhGaussianPolicy(policy.version, policy.architecture, arrays, self._low, self._high)
+        ready.warm_up(self._spec.observation_dim)
+        return ready

@@ -1,0 +1,144 @@
+"""The agent's loop: wait for the newest observation, answer it, swap policies in between."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent_service.adoption import Adoption
+from agent_service.inference import ActingPolicy, UniformPolicy
+from rtcore import channels
+from rtcore.bus import Bus, Received
+from rtcore.clock import Clock
+from rtcore.config import RunConfig
+from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop
+from rtcore.messages import Action, Command, CommandReply, Spec, Step
+
+WAIT_S = 0.2  # how long a wait may last before `stop` is looked at
+AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's
+
+
+class AgentService:
+    """Answers every observation of one environment.
+
+    In a process `run` acts on one thread and `check_policies` works on another; in virtual time the
+    driver calls `poll_policies` and `poll` instead.
+    """
+
+    def __init__(self, config: RunConfig, bus: Bus, clock: Clock, ledger: Ledger) -> None:
+        name = config.env.name
+        self._clock = clock
+        self._ledger = ledger
+        self._rng = np.random.default_rng([config.seed, AGENT_STREAM])
+        self._specs = bus.latest(channels.SPEC, name)
+        self._steps = bus.latest(channels.STEP, name)
+        self._policies = bus.queue(channels.POLICY, capacity=64)
+        self._actions = bus.publisher(channels.ACTION, name)
+        self._spec: Spec | None = None
+        self._policy: ActingPolicy | None = None
+        self._adoption: Adoption | None = None
+        self._reaction = ledger.histogram("reaction")
+        self._publish_to_adopt = ledger.histogram("publish_to_adopt")
+
+    def run(self, stop: Stop) -> None:
+        """Act until stopped."""
+        while not stop.is_set():
+            received = self._steps.wait(WAIT_S)
+            if received is not None:
+                self.act(received)
+
+    def check_policies(self, stop: Stop) -> None:
+        """Check policies as they arrive, until stopped; for a thread beside `run`."""
+        while not stop.is_set():
+            if self._adoption is None:
+                stop.wait(0.01)
+            elif self._policies.wait(WAIT_S):
+                self.poll_policies()
+
+    def poll(self) -> None:
+        """Answer the newest observation, if there is one that was not answered."""
+        received = self._steps.take()
+        if received is not None:
+            self.act(received)
+
+    def poll_policies(self) -> None:
+        """Check the policies that have arrived. Does nothing before the environment is known."""
+        if self._adoption is None:
+            return
+        for received in self._policies.drain():
+            self._adoption.offer(received.message, self._clock.now_ns())
+
+    def act(self, received: Received[Step]) -> None:
+        """Answer one observation; swap first, if a policy is ready."""
+        step = received.message
+        if not self._knows(step):
+            self._ledger.count("observations.unknown")
+            return
+        assert self._spec is not None and self._policy is not None
+        self._ledger.count("observations")
+        if len(step.observation) != 4 * self._spec.observation_dim:
+            self._ledger.count("observations.invalid")
+            return
+        self._swap(step)
+        action = self._policy.act(np.frombuffer(step.observation, np.float32), self._rng)
+        self._actions.put(
+            Action(
+                env=step.env,
+                incarnation=step.incarnation,
+                tick=step.tick,
+                values=action.tobytes(),
+                policy_version=self._policy.version,
+                received_ns=received.received_ns,
+                sent_ns=self._clock.now_ns(),
+            )
+        )
+        self._reaction.record(self._clock.now_ns() - received.received_ns)
+        self._ledger.count("actions")
+
+    def command(self, command: Command) -> CommandReply:
+        """Answer an operator; called on the bus's thread."""
+        if command.verb != "status":
+            return CommandReply(id=command.id, ok=False, text=f"the agent knows no '{command.verb}'")
+        version = self._policy.version if self._policy is not None else "none"
+        text = f"policy {version}, {self._ledger.counter('actions')} actions"
+        return CommandReply(id=command.id, ok=True, text=text)
+
+    def close(self) -> None:
+        """Account for a policy that was ready and never acted."""
+        if self._adoption is not None and self._adoption.take() is not None:
+            self._ledger.count("policies.unused")
+
+    def _swap(self, step: Step) -> None:
+        assert self._adoption is not None
+        ready = self._adoption.take()
+        if ready is None:
+            return
+        self._policy, policy = ready
+        now_ns = self._clock.now_ns()
+        self._publish_to_adopt.record(max(0, now_ns - policy.created_ns))
+        self._ledger.count("policies.adopted")
+        self._ledger.gauge("policy_version", policy.version)
+        self._ledger.event(
+            now_ns, "DEBUG", f"policy {policy.version} (window {policy.window}, iterate {policy.iterate}) "
+            f"acts from tick {step.tick + 1}"
+        )  # fmt: skip
+
+    def _knows(self, step: Step) -> bool:
+        """Whether the environment behind `step` has declared itself; takes its declaration if new."""
+        if self._spec is not None and self._spec.incarnation == step.incarnation:
+            return True
+        declared = self._specs.take()
+        if declared is not None:
+            self._meet(declared.message)
+        return self._spec is not None and self._spec.incarnation == step.incarnation
+
+    def _meet(self, spec: Spec) -> None:
+        changed = self._spec is None or (
+            (spec.observation_dim, spec.action_low, spec.action_high)
+            != (self._spec.observation_dim, self._spec.action_low, self._spec.action_high)
+        )
+        self._spec = spec
+        if changed:
+            low, high = np.asarray(spec.action_low, np.float32), np.asarray(spec.action_high, np.float32)
+            self._policy = UniformPolicy(low, high)
+            self._adoption = Adoption(spec, self._ledger)

@@ -1,0 +1,185 @@
+"""The agent on a virtual clock: who is answered, with which policy, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from agent_service.service import AgentService
+from rtcore import channels
+from rtcore.bus import Bus
+from rtcore.clock import VirtualClock
+from rtcore.config import RunConfig
+from rtcore.ledger import Ledger
+from rtcore.memory_bus import MemoryHub
+from rtcore.messages import Action, Architecture, Policy, Spec, Step
+from rtcore.weights import expected_shapes, pack, sha256
+
+ARCHITECTURE = Architecture(kind="tanh_gaussian_mlp", observation_dim=3, action_dim=2, hidden=[4])
+SPEC = Spec(
+    env="env0", env_id="test", incarnation=7, t0_ns=0, wall_t0_ns=0, tick_ns=5_000_000, unit_ns=10**9,
+    observation_dim=3, action_dim=2, action_low=[-2.0, 0.0], action_high=[2.0, 1.0],
+)  # fmt: skip
+
+
+def step(tick: int, *, incarnation: int = 7, dim: int = 3) -> Step:
+    return Step(
+        env="env0", incarnation=incarnation, seq=tick, tick=tick, episode=0, episode_tick=tick, unit=0, due_ns=0,
+        woke_ns=0, sent_ns=0, observation=np.zeros(dim, np.float32).tobytes(), reward=0.0, terminated=False,
+        truncated=False, action=b"", decision=b"", answered_tick=-1, policy_version=-1, missed=False, fallback="",
+        cause="", skipped=0, loop_ns=-1, reaction_ns=-1, drift=0.0, position=b"",
+    )  # fmt: skip
+
+
+def policy(version: int, *, mean_bias: float = 0.0, architecture: Architecture = ARCHITECTURE) -> Policy:
+    """Acts tanh(mean_bias), without noise."""
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(architecture).items()}
+    arrays["mean.bias"][:] = mean_bias
+    arrays["log_std.bias"][:] = -100
+    weights = pack(arrays)
+    return Policy(
+        version=version, window=0, iterate=1, algo="sac", architecture=architecture, weights=weights,
+        sha256=sha256(weights), created_ns=0,
+    )  # fmt: skip
+
+
+class Rig:
+    """An agent, and the two ends that it talks to."""
+
+    def __init__(self, hub: MemoryHub, seed: int = 3) -> None:
+        self.clock = VirtualClock(1_000)
+        self.env: Bus = hub.bus(channels.ENV_SERVER, self.clock)
+        self.learner: Bus = hub.bus(channels.LEARNER, self.clock)
+        self.ledger = Ledger(channels.AGENT, 1)
+        self.agent = AgentService(
+            RunConfig(seed=seed), hub.bus(channels.AGENT, self.clock), self.clock, self.ledger
+        )
+        self.actions = self.env.queue(channels.ACTION, "env0")
+        self.specs = self.env.publisher(channels.SPEC, "env0")
+        self.steps = self.env.publisher(channels.STEP, "env0")
+        self.policies = self.learner.publisher(channels.POLICY)
+
+    def answer(self, observed: Step) -> Action | None:
+        self.steps.put(observed)
+        self.agent.poll_policies()
+        self.agent.poll()
+        answers = self.actions.drain()
+        assert len(answers) <= 1
+        return answers[0].message if answers else None
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    yield Rig(MemoryHub())
+
+
+def values(action: Action | None) -> np.ndarray:
+    assert action is not None
+    return np.frombuffer(action.values, np.float32)
+
+
+def test_before_the_environment_is_known_nothing_is_answered(rig: Rig) -> None:
+    assert rig.answer(step(0)) is None
+    assert rig.ledger.counter("observations.unknown") == 1
+
+
+def test_pi_0_answers_within_the_bounds_and_repeats_with_its_seed(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    answers = [rig.answer(step(tick)) for tick in range(50)]
+    assert [(a.tick, a.incarnation, a.policy_version) for a in answers if a] == [(t, 7, 0) for t in range(50)]
+    drawn = np.array([values(a) for a in answers])
+    assert (drawn >= [-2, 0]).all() and (drawn <= [2, 1]).all() and drawn.std(0).min() > 0.2
+    other = Rig(MemoryHub())
+    other.specs.put(SPEC)
+    np.testing.assert_array_equal(drawn, [values(other.answer(step(tick))) for tick in range(50)])
+
+
+def test_only_the_newest_observation_is_answered(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    for tick in range(5):
+        rig.steps.put(step(tick))
+    answer = rig.answer(step(5))
+    assert answer is not None and answer.tick == 5
+    assert rig.ledger.counter("observations") == 1
+
+
+def test_a_policy_acts_from_the_next_observation_on(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    rig.policies.put(policy(1, mean_bias=0.5))
+    rig.clock.advance_ns(250)
+    answer = rig.answer(step(1))
+    assert answer is not None and answer.policy_version == 1
+    np.testing.assert_allclose(values(answer), [2 * np.tanh(0.5), 0.5 + 0.5 * np.tanh(0.5)], rtol=1e-6)
+    assert rig.ledger.counter("policies.adopted") == 1
+    assert rig.ledger.histogram("publish_to_adopt").max == 1_250
+
+
+def test_a_policy_that_never_acted_is_superseded_and_a_repeat_counts_apart(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    for version in (1, 2, 2, 3):
+        rig.policies.put(policy(version))
+    answer = rig.answer(step(1))
+    rig.policies.put(policy(4))
+    rig.agent.poll_policies()
+    rig.agent.close()
+    assert answer is not None and answer.policy_version == 3
+    counts = {name: rig.ledger.counter(f"policies.{name}") for name in
+              ("received", "adopted", "superseded", "repeated", "rejected", "unused")}  # fmt: skip
+    assert counts == {"received": 4, "adopted": 1, "superseded": 2, "repeated": 1, "rejected": 0, "unused": 1}
+
+
+def spoiled_hash(version: int) -> Policy:
+    good = policy(version)
+    return Policy(**{name: getattr(good, name) for name in good.__struct_fields__ if name != "sha256"}, sha256="0" * 64)
+
+
+def spoiled_weights(version: int) -> Policy:
+    return policy(version, mean_bias=float("nan"))
+
+
+def other_shape(version: int) -> Policy:
+    wider = Architecture(kind="tanh_gaussian_mlp", observation_dim=4, action_dim=2, hidden=[4])
+    return policy(version, architecture=wider)
+
+
+@pytest.mark.parametrize("make", [spoiled_hash, spoiled_weights, other_shape])
+def test_a_bad_policy_is_refused_and_the_old_one_goes_on(rig: Rig, make) -> None:  # type: ignore[no-untyped-def]
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    rig.policies.put(policy(1, mean_bias=0.5))
+    rig.answer(step(1))
+    rig.policies.put(make(2))
+    answer = rig.answer(step(2))
+    assert answer is not None and answer.policy_version == 1
+    assert rig.ledger.counter("policies.rejected") == 1
+    assert "policy 2 refused" in rig.ledger.stats(0).events[-1].text
+
+
+def test_a_version_from_the_past_is_refused(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    rig.policies.put(policy(5))
+    rig.answer(step(1))
+    rig.policies.put(policy(4))
+    answer = rig.answer(step(2))
+    assert answer is not None and answer.policy_version == 5
+    assert rig.ledger.counter("policies.rejected") == 1
+
+
+def test_a_malformed_observation_is_counted_and_not_answered(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    assert rig.answer(step(0, dim=4)) is None
+    assert rig.ledger.counter("observations.invalid") == 1
+
+
+def test_a_restarted_environment_is_answered_once_it_declares_itself(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    assert rig.answer(step(0, incarnation=8)) is None
+    rig.specs.put(Spec(**{n: getattr(SPEC, n) for n in SPEC.__struct_fields__ if n != "incarnation"}, incarnation=8))
+    answer = rig.answer(step(1, incarnation=8))
+    assert answer is not None and answer.incarnation == 8
