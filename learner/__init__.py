@@ -1,0 +1,1 @@
+"""The student: replay, critics, forecasts, policy improvement, and when to publish it."""

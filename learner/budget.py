@@ -1,0 +1,36 @@
+"""How many gradient steps the learner may make: the update-to-data limit."""
+
+from __future__ import annotations
+
+from rtcore.config import LearnerConfig
+from rtcore.messages import Phase
+
+SHARE = {"full": 1.0, "half": 0.5, "off": 0.0}
+
+
+class UpdateBudget:
+    """Earned by transitions, spent by gradient steps.
+
+    Each transition after the first `learning_starts` earns `utd` steps; in a hold, `hold_learning`'s
+    share of it, so that "off" leaves no debt to be worked off when the next window begins.
+    """
+
+    def __init__(self, config: LearnerConfig) -> None:
+        self._utd = config.utd
+        self._waiting = config.learning_starts
+        self._hold_share = SHARE[config.hold_learning]
+        self._credit = 0.0
+
+    def earn(self, transitions: int, phase: Phase) -> None:
+        """Take note of new transitions in the replay."""
+        late = max(0, transitions - self._waiting)
+        self._waiting -= transitions - late
+        self._credit += late * self._utd * (1.0 if phase == "update" else self._hold_share)
+
+    def allows(self) -> bool:
+        """Whether one more gradient step may be made."""
+        return self._credit >= 1.0
+
+    def spend(self) -> None:
+        """One gradient step was made."""
+        self._credit -= 1.0

@@ -1,0 +1,81 @@
+"""The iterates as the agents get them: numbered, stamped, hashed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from learner.algorithm import Algorithm
+from learner.conductor import PublishDue
+from learner.outbox import Outbox
+from rtcore.clock import Clock
+from rtcore.ledger import Ledger
+from rtcore.messages import Phase, Policy, Spec, WindowNotice
+from rtcore.weights import pack, sha256
+from rtcore.windows import WindowClock
+
+
+class Publication:
+    """Publishes iterates, never in a hold.
+
+    Counts `published`, `withheld` (an iterate whose time was over before it was ready), and, from the
+    phases as they were announced, `published_in_hold`, which must stay 0. An unchanged policy is not
+    published again.
+    """
+
+    def __init__(self, algo: str, notices: Sequence[WindowNotice], outbox: Outbox, ledger: Ledger) -> None:
+        """`notices` are the announced phases; the service appends to them."""
+        self._algo = algo
+        self._notices = notices
+        self._outbox = outbox
+        self._ledger = ledger
+        self._version = 0
+        self.improved = False  # since the last one
+
+    def go_on_from(self, version: int) -> None:
+        """Number the next policy after `version`, the last one of an earlier learner of this run."""
+        self._version = version
+
+    def publish(self, algorithm: Algorithm, due: PublishDue, spec: Spec, clock: Clock, windows: WindowClock) -> None:
+        """Publish the policy as it is, unless nothing has changed or its time is over meanwhile."""
+        if not self.improved:
+            return
+        weights = pack(algorithm.policy_arrays())
+        digest = sha256(weights)
+        created_ns = clock.now_ns()
+        position = windows.position(created_ns - spec.t0_ns)
+        if position.window.m != due.window.m or position.phase == "hold":
+            self.withhold(due.window.m, due.iterate, created_ns)
+            return
+        self._version += 1
+        self.improved = False
+        self._ledger.count("published")
+        self._ledger.set_counter("last_version", self._version)
+        if announced_phase(self._notices, created_ns) == "hold":
+            self._ledger.count("published_in_hold")
+        policy = Policy(
+            version=self._version,
+            window=due.window.m,
+            iterate=due.iterate,
+            algo=self._algo,
+            architecture=algorithm.architecture,
+            weights=weights,
+            sha256=digest,
+            created_ns=created_ns,
+        )
+        self._outbox.put(policy)
+
+    def withhold(self, window: int, iterate: int, now_ns: int) -> None:
+        """Account for an iterate that came too late."""
+        if self.improved:
+            self._ledger.count("withheld")
+            self._ledger.event(now_ns, "INFO", f"window {window}, iterate {iterate}: not published in time")
+
+
+def announced_phase(notices: Sequence[WindowNotice], at_ns: int) -> Phase:
+    """The phase at an instant, by the notices alone; before the first it is an update phase."""
+    phase: Phase = "update"
+    for notice in notices:
+        if notice.at_ns > at_ns:
+            break
+        phase = notice.phase
+    return phase

@@ -1,0 +1,225 @@
+"""The learner's loop: take what the world did, improve, forecast and publish when it is time.
+
+One thread trains; messages arrive on the bus's threads and leave through the outbox's. `step` is one
+turn of the loop and never waits; `run` repeats it in a process, `catch_up` in virtual time.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import assert_never
+
+from learner import resume
+from learner.algorithm import Algorithm, make_algorithm
+from learner.budget import UpdateBudget
+from learner.conductor import (
+    Conductor,
+    Happening,
+    PhaseEntered,
+    PublishDue,
+    PublishMissed,
+    UnitEnded,
+    WindowEntered,
+)
+from learner.intake import Intake
+from learner.outbox import Outbox
+from learner.publication import Publication
+from learner.replay import open_replay
+from rtcore import channels
+from rtcore.bus import Bus
+from rtcore.clock import Clock
+from rtcore.config import RunConfig
+from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop
+from rtcore.messages import Command, CommandReply, Spec, WindowNotice
+from rtcore.run_dir import RunDir
+from rtcore.windows import WindowClock, make_schedule
+
+IDLE_WAIT_S = 0.02  # nothing to learn from: wait so long for the next batch (they come every 50 ms)
+DRAIN_LIMIT_S = 2.0  # after the stop: wait so long for the env server's last batch
+LEAD_FLOOR_NS = 50_000_000  # publish at least so long before the unit ends; an idle wait fits in twice
+METRICS_PERIOD_NS = 250_000_000
+LEARNER_STREAM = 2  # keeps the learner's random numbers apart from the world's and the agent's
+
+
+class LearnerService:
+    """Trains on the log of one environment."""
+
+    def __init__(self, config: RunConfig, run_dir: RunDir, bus: Bus, clock: Clock, ledger: Ledger) -> None:
+        self._config = config
+        self._run_dir = run_dir
+        self._clock = clock
+        self._ledger = ledger
+        self._specs = bus.latest(channels.SPEC, config.env.name)
+        self._intake = Intake(bus, config.env.name, ledger)
+        self.outbox = Outbox(bus, run_dir)
+        self._windows = WindowClock(make_schedule(config.learner.schedule), round(config.env.unit_s * 1e9))
+        self._conductor = Conductor(self._windows)
+        self._budget = UpdateBudget(config.learner)
+        self._notices: list[WindowNotice] = []
+        self._publication = Publication(config.learner.algo, self._notices, self.outbox, ledger)
+        self._orders: list[str] = []  # from the bus's thread; carried out between two steps
+        self._spec: Spec | None = None
+        self._algorithm: Algorithm | None = None
+        self._lead_ns = LEAD_FLOOR_NS
+        self._step_ns = 0
+        self._metrics_due_ns = 0
+
+    def run(self, stop: Stop) -> None:
+        """Learn until stopped, then take what the env server still sends."""
+        while not stop.is_set():
+            if not self.step():
+                self._intake.wait(IDLE_WAIT_S)
+            elif self._at_half_power():
+                stop.wait(self._step_ns / 1e9)
+        deadline = time.monotonic() + DRAIN_LIMIT_S
+        while not self._intake.ended and time.monotonic() < deadline:
+            self._intake.wait(IDLE_WAIT_S)
+            self._take_in()
+
+    def catch_up(self) -> None:
+        """Do all the work that is there now, as virtual time lets it."""
+        while self.step():
+            pass
+        self.outbox.flush()
+
+    def step(self) -> bool:
+        """Take in, keep the schedule, make at most one gradient step. Says whether it made one."""
+        self._take_in()
+        if self._spec is None or self._algorithm is None:
+            return False
+        self._keep_schedule(self._spec)
+        if not self._budget.allows():
+            return False
+        begin_ns = self._clock.now_ns()
+        improve = self._conductor.improving
+        self._algorithm.update(improve_policy=improve)
+        self._budget.spend()
+        self._publication.improved |= improve
+        self._ledger.count("gradient_steps")
+        if improve:
+            self._ledger.count("policy_steps")
+        self._note_duration(self._clock.now_ns() - begin_ns)
+        return True
+
+    def command(self, command: Command) -> CommandReply:
+        """Answer an operator; called on the bus's thread."""
+        if command.verb == "status":
+            return CommandReply(id=command.id, ok=True, text=self._describe())
+        if command.verb in ("hold", "resume"):
+            self._orders.append(command.verb)
+            done = "the policy is held" if command.verb == "hold" else "the schedule goes on"
+            return CommandReply(id=command.id, ok=True, text=done)
+        return CommandReply(id=command.id, ok=False, text=f"the learner knows no '{command.verb}'")
+
+    def close(self) -> None:
+        """Account for what never came, and write the checkpoint."""
+        self._intake.finish()
+        if self._algorithm is not None:
+            self._ledger_metrics(self._algorithm)
+            resume.save(self._run_dir, self._algorithm)
+
+    # ---- turning the crank
+
+    def _take_in(self) -> None:
+        declared = self._specs.take()
+        if declared is not None:
+            self._meet(declared.message)
+        if self._spec is None:
+            return
+        learned = self._intake.take()
+        if learned:
+            phase = self._conductor.position.phase if self._conductor.position else "update"
+            self._budget.earn(learned, phase)
+
+    def _meet(self, spec: Spec) -> None:
+        if self._spec is not None:
+            self._ledger.event(self._clock.now_ns(), "WARN", "the env server came back; its clock is kept")
+            return
+        self._spec = spec
+        learner = self._config.learner
+        directory = self._run_dir.learner_dir / resume.REPLAY_DIR
+        replay = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
+        self._intake.meet(spec, replay)
+        seed = self._config.seed * 10 + LEARNER_STREAM
+        self._algorithm = make_algorithm(learner, spec.observation_dim, spec.action_dim, seed, replay)
+        if resume.restore(self._run_dir, self._algorithm):
+            version = resume.last_published(self._run_dir)
+            self._publication.go_on_from(version)
+            text = f"goes on from the run's checkpoint: policy {version}, {len(replay)} transitions in the replay"
+            self._ledger.event(self._clock.now_ns(), "INFO", text)
+
+    def _keep_schedule(self, spec: Spec) -> None:
+        now_ns = self._clock.now_ns()
+        run_ns = now_ns - spec.t0_ns
+        if run_ns < 0:
+            return
+        lead_ns = min(max(self._lead_ns, spec.tick_ns), spec.unit_ns)
+        happenings = self._conductor.advance(run_ns, lead_ns)
+        while self._orders:
+            order = self._orders.pop(0)
+            obey = self._conductor.pause if order == "hold" else self._conductor.resume
+            happenings += obey(run_ns)
+            self._ledger.event(now_ns, "INFO", f"operator: {order}")
+        for happening in happenings:
+            self._handle(happening, spec)
+        if now_ns >= self._metrics_due_ns and self._algorithm is not None:
+            self._metrics_due_ns = now_ns + METRICS_PERIOD_NS
+            self._ledger_metrics(self._algorithm)
+
+    def _handle(self, happening: Happening, spec: Spec) -> None:
+        assert self._algorithm is not None
+        match happening:
+            case UnitEnded(unit):
+                self._algorithm.end_unit(unit)
+            case WindowEntered(window, unit):
+                self._algorithm.begin_window(window, unit)
+            case PhaseEntered():
+                self._announce(happening, spec)
+            case PublishDue():
+                self._publication.publish(self._algorithm, happening, spec, self._clock, self._windows)
+            case PublishMissed(window, iterate):
+                self._publication.withhold(window.m, iterate, self._clock.now_ns())
+            case _:
+                assert_never(happening)
+
+    def _announce(self, entered: PhaseEntered, spec: Spec) -> None:
+        window = entered.window
+        notice = WindowNotice(
+            window=window.m,
+            start_unit=window.start,
+            update_units=window.update,
+            hold_units=window.hold,
+            phase=entered.phase,
+            at_ns=spec.t0_ns + entered.start_ns,
+            reason=entered.reason,
+        )
+        self._notices.append(notice)
+        self._ledger.windows(self._notices)
+        self.outbox.put(notice)
+
+    # ---- small things
+
+    def _at_half_power(self) -> bool:
+        return self._config.learner.hold_learning == "half" and not self._conductor.improving
+
+    def _note_duration(self, duration_ns: int) -> None:
+        """Keep the publication lead above the time that a step takes (slowly forgotten maximum)."""
+        self._step_ns = duration_ns
+        self._lead_ns = max(LEAD_FLOOR_NS, 2 * duration_ns, round(0.99 * self._lead_ns))
+
+    def _ledger_metrics(self, algorithm: Algorithm) -> None:
+        for name, value in algorithm.metrics().items():
+            self._ledger.gauge(name, value)
+        self._ledger.gauge("replay_size", self._intake.replay_size)
+
+    def _describe(self) -> str:
+        position = self._conductor.position
+        if position is None:
+            return "no environment yet"
+        phase = "update" if self._conductor.improving else "hold"
+        return (
+            f"window {position.window.m}, {phase}, unit {position.unit}, "
+            f"{self._ledger.counter('gradient_steps')} gradient steps, "
+            f"policy {self._ledger.counter('last_version')}"
+        )

@@ -1,0 +1,42 @@
+"""The update-to-data limit, counted by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from learner.budget import UpdateBudget
+from rtcore.config import LearnerConfig
+
+
+def spend_all(budget: UpdateBudget) -> int:
+    steps = 0
+    while budget.allows():
+        budget.spend()
+        steps += 1
+    return steps
+
+
+def test_nothing_before_learning_starts_then_utd_per_transition() -> None:
+    budget = UpdateBudget(LearnerConfig(utd=2.0, learning_starts=10))
+    budget.earn(9, "update")
+    assert spend_all(budget) == 0
+    budget.earn(4, "update")  # 13 in all: 3 beyond the start
+    assert spend_all(budget) == 6
+
+
+def test_a_fraction_adds_up() -> None:
+    budget = UpdateBudget(LearnerConfig(utd=0.25, learning_starts=0))
+    made = []
+    for _ in range(8):
+        budget.earn(1, "update")
+        made.append(spend_all(budget))
+    assert made == [0, 0, 0, 1, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(("share", "steps"), [("full", 8), ("half", 4), ("off", 0)])
+def test_a_hold_earns_its_share_and_leaves_no_debt(share: str, steps: int) -> None:
+    budget = UpdateBudget(LearnerConfig(utd=1.0, learning_starts=0, hold_learning=share))  # type: ignore[arg-type]
+    budget.earn(8, "hold")
+    assert spend_all(budget) == steps
+    budget.earn(3, "update")
+    assert spend_all(budget) == 3

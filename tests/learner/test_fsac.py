@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from learner.fsac import Fsac
+from learner.sac import Sac
+from rtcore.config import LearnerConfig
+from rtcore.windows import Window
+from tests.learner.small import ACTION_DIM, OBSERVATION_DIM, filled_replay, forq, small_config
+
+UPDATES_PER_UNIT = 4
+WINDOW_0, WINDOW_1 = Window(m=0, start=0, update=3, hold=1), Window(m=1, start=4, update=3, hold=1)
+
+
+def make_fsac(config: LearnerConfig | None = None, seed: int = 3) -> Fsac:
+    config = config or small_config(algo="fsac", forecast=forq())
+    return Fsac(config, OBSERVATION_DIM, ACTION_DIM, seed, filled_replay())
+
+
+def learn_units(student: Sac, units: range) -> None:
+    for unit in units:
+        for _ in range(UPDATES_PER_UNIT):
+            student.update(improve_policy=True)
+        student.end_unit(unit)
+
+
+def in_second_window(config: LearnerConfig | None = None) -> Fsac:
+    fsac = make_fsac(config)
+    fsac.begin_window(WINDOW_0, 0)
+    learn_units(fsac, range(4))
+    fsac.begin_window(WINDOW_1, 4)
+    return fsac
+
+
+def probe() -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.linspace(-1, 1, 30).view(10, OBSERVATION_DIM), torch.linspace(-0.9, 0.9, 20).view(
+        10, ACTION_DIM
+    )
+
+
+def same_bits(first: Sac, second: Sac, prefix: str = "") -> bool:
+    a, b = first.state().tensors, second.state().tensors
+    names = [name for name in a if name.startswith(prefix) and not name.startswith("history.")]
+    assert names
+    return all(a[name].tobytes() == b[name].tobytes() for name in names)
+
+
+def times(fsac: Fsac) -> list[int]:
+    return [snapshot.time for snapshot in fsac._history.snapshots]
+
+
+def set_constant_critic(fsac: Fsac, value: float) -> None:
+    """Q(s, a) = value everywhere."""
+    fsac._critic.flat.zero_()
+    fsac._critic.views(fsac._critic.flat)["2.bias"].fill_(value)
+
+
+@pytest.mark.parametrize("forecast", [forq(kind="none"), forq(trust="never")])
+def test_without_a_forecast_it_is_sac_bit_for_bit(forecast: object) -> None:
+    fsac = make_fsac(small_config(algo="fsac", forecast=forecast))
+    sac = Sac(small_config(), OBSERVATION_DIM, ACTION_DIM, 3, filled_replay())
+    for student in (fsac, sac):
+        for m in range(4):
+            student.begin_window(Window(m=m, start=3 * m, update=3, hold=0), 3 * m)
+            learn_units(student, range(3 * m, 3 * m + 3))
+    assert sac.gradient_steps == 48
+    for student in (fsac, sac):
+        student.update(improve_policy=True)
+        student.update(improve_policy=False)
+    assert same_bits(sac, fsac)
+    for name in ("batches", "noise"):
+        assert sac.state().scalars["rng"][name] == fsac.state().scalars["rng"][name]
+
+
+def test_with_a_forecast_it_is_not_sac() -> None:
+    fsac = in_second_window()
+    sac = Sac(small_config(), OBSERVATION_DIM, ACTION_DIM, 3, filled_replay())
+    learn_units(sac, range(4))
+    assert same_bits(sac, fsac)
+    for student in (fsac, sac):
+        student.update(improve_policy=True)
+    assert same_bits(sac, fsac, "critic.")  # the forecast is in the policy's loss alone
+    assert same_bits(sac, fsac, "target.")
+    assert same_bits(sac, fsac, "temperature.")
+    assert not same_bits(sac, fsac, "actor.")
+
+
+def test_true_copies_do_not_move_when_the_critic_trains() -> None:
+    fsac = make_fsac()
+    learn_units(fsac, range(1))
+    (copy,) = fsac._history.snapshots
+    at_end = copy.value(*probe()).clone()
+    torch.testing.assert_close(at_end, fsac._critic_value(*probe()), rtol=0, atol=0)
+    learn_units(fsac, range(1, 3))
+    assert torch.equal(copy.value(*probe()), at_end)
+    assert not torch.equal(fsac._critic_value(*probe()), at_end)
+
+
+def test_the_policy_climbs_the_weighted_sum_of_the_copies() -> None:
+    fsac = in_second_window()
+    # times -2, -1, 0 and t_q = 4, the window's length: 1/3 + (4 + 1) * (-1, 0, 1) / 2
+    weights = [1 / 3 - 2.5, 1 / 3, 1 / 3 + 2.5]
+    assert times(fsac) == [2, 3, 4]
+    values = torch.stack([snapshot.value(*probe()) for snapshot in fsac._history.snapshots])
+    wanted = (torch.tensor(weights)[:, None] * values).sum(0)
+    torch.testing.assert_close(fsac._policy_value(*probe()), wanted, rtol=1e-5, atol=1e-5)
+    seen = fsac.metrics()
+    assert seen["forecast/weight_norm"] == pytest.approx(float(np.linalg.norm(weights)))
+    assert (seen["forecast/horizon"], seen["forecast/snapshots"]) == (4.0, 3.0)
+
+
+def test_the_actor_descends_on_the_forecast_loss() -> None:
+    fsac, twin = in_second_window(), make_fsac(seed=8)
+    twin.load(fsac.state())
+    fsac.update(improve_policy=True)
+    twin._draw_batch()
+    alpha, observation = twin.metrics()["alpha"], twin._sampled.observation
+    action, log_prob = twin._propose(observation)
+    past = [snapshot.value(observation, action) for snapshot in twin._history.snapshots]
+    value = -13 / 6 * past[0] + 1 / 3 * past[1] + 17 / 6 * past[2]  # weights as above
+    loss = (alpha * log_prob - value).mean()
+    assert fsac.metrics()["loss/actor"] == pytest.approx(loss.item(), rel=1e-4)
+    wanted = torch.autograd.grad(loss, twin._actor.leaves)
+    for found, gradient in zip(fsac._actor.views(fsac._actor.grad).values(), wanted, strict=True):
+        torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-5)
+
+
+def test_the_forecast_stays_while_the_window_lasts() -> None:
+    fsac = in_second_window()
+    before = fsac._policy_value(*probe())
+    learn_units(fsac, range(4, 7))
+    fsac.begin_window(WINDOW_1, 6)  # entered again, after a restart
+    assert torch.equal(fsac._policy_value(*probe()), before)
+    learn_units(fsac, range(7, 8))
+    fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 8)
+    assert not torch.equal(fsac._policy_value(*probe()), before)
+
+
+def test_it_uses_the_snapshots_there_are() -> None:
+    fsac = make_fsac(small_config(algo="fsac", forecast=forq(l_p=10)))
+    fsac.begin_window(WINDOW_0, 0)
+    assert fsac.metrics()["forecast/snapshots"] == 0
+    torch.testing.assert_close(fsac._policy_value(*probe()), fsac._critic_value(*probe()), rtol=0, atol=0)
+    learn_units(fsac, range(2))
+    fsac.begin_window(WINDOW_1, 4)
+    assert fsac.metrics()["forecast/snapshots"] == 2
+
+
+def test_critics_that_have_not_learnt_are_not_kept() -> None:
+    fsac = make_fsac()
+    fsac.end_unit(0)
+    assert times(fsac) == []
+    fsac.update(improve_policy=True)
+    fsac.end_unit(1)
+    assert times(fsac) == [2]
+
+
+def test_a_unit_that_ends_again_replaces_what_came_after() -> None:
+    fsac = make_fsac()
+    learn_units(fsac, range(3))
+    fsac.end_unit(1)
+    assert times(fsac) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("window", "configured", "horizon"),
+    [
+        (Window(m=1, start=4, update=3, hold=2), None, 5.0),
+        (Window(m=1, start=4, update=3, hold=None), None, 3.0),
+        (Window(m=1, start=4, update=3, hold=2), 12.5, 12.5),
+    ],
+)
+def test_the_horizon(window: Window, configured: float | None, horizon: float) -> None:
+    fsac = make_fsac(small_config(algo="fsac", forecast=forq(horizon=configured)))
+    learn_units(fsac, range(4))
+    fsac.begin_window(window, 4)
+    assert fsac.metrics()["forecast/horizon"] == horizon
+
+
+def test_a_forecast_is_judged_by_the_critic_reached() -> None:
+    fsac = make_fsac(small_config(algo="fsac", forecast=forq(l_p=2)))
+    fsac.update(improve_policy=True)
+    for unit, value in ((2, 1.0), (3, 2.0)):
+        set_constant_critic(fsac, value)
+        fsac.end_unit(unit)
+    fsac.begin_window(WINDOW_1, 4)  # a line through 1, 2: Qtilde = 6 at t = 8
+    assert fsac._policy_value(*probe()).tolist() == pytest.approx([6.0] * 10, abs=1e-5)
+    set_constant_critic(fsac, 5.5)
+    fsac.end_unit(7)
+    fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 8)
+    seen = fsac.metrics()
+    assert seen["forecast/windows"] == 1
+    assert seen["forecast/error"] == pytest.approx(0.5, abs=1e-5)
+    assert seen["forecast/baseline_error"] == pytest.approx(3.5, abs=1e-5)
+
+
+def test_a_forecast_is_not_judged_late() -> None:
+    fsac = in_second_window()
+    learn_units(fsac, range(4, 9))
+    fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 9)
+    assert fsac.metrics()["forecast/windows"] == 0

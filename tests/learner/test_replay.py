@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.replay import Batch, Replay, ReplayError, make_batch, open_replay
+
+RNG = np.random.default_rng
+
+
+def add(replay: Replay, number: int, unit: int) -> None:
+    """A transition whose every field says its number."""
+    observation = np.array([number, -number], np.float32)
+    action = np.array([number / 1000], np.float32)
+    replay.add(observation, action, float(number), observation + 1, number % 2 == 1, unit)
+
+
+def drawn(replay: Replay, since_unit: int | None = None, size: int = 400) -> Batch:
+    batch = make_batch(size, 2, 1)
+    replay.sample(RNG(0), batch, since_unit)
+    return batch
+
+
+def test_a_sample_keeps_the_fields_of_a_transition_together() -> None:
+    replay = Replay(10, 2, 1)
+    for number in range(5):
+        add(replay, number, 0)
+    batch = drawn(replay)
+    assert set(batch.reward) == {0, 1, 2, 3, 4}
+    np.testing.assert_array_equal(batch.observation, np.stack([batch.reward, -batch.reward], axis=1))
+    np.testing.assert_array_equal(batch.next_observation, batch.observation + 1)
+    np.testing.assert_allclose(batch.action[:, 0], batch.reward / 1000)
+    np.testing.assert_array_equal(batch.terminated, batch.reward % 2 == 1)
+
+
+def test_a_full_ring_forgets_the_oldest() -> None:
+    replay = Replay(4, 2, 1)
+    for number in range(10):
+        add(replay, number, number)
+    assert len(replay) == 4
+    assert replay.newest_unit == 9
+    assert set(drawn(replay).reward) == {6, 7, 8, 9}
+
+
+def test_draws_are_uniform() -> None:
+    replay = Replay(8, 2, 1)
+    for number in range(12):  # the ring wraps in the middle of what is drawn from
+        add(replay, number, number // 2)
+    counts = np.bincount(drawn(replay, since_unit=3, size=6000).reward.astype(int), minlength=12)
+    assert counts[:6].sum() == 0
+    assert np.all(np.abs(counts[6:] - 1000) < 150)  # five standard deviations of Binomial(6000, 1/6)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    capacity=st.integers(1, 12),
+    steps=st.lists(st.integers(0, 2), min_size=1, max_size=40),
+    since=st.integers(-1, 12),
+)
+def test_the_recency_window_agrees_with_a_list(capacity: int, steps: list[int], since: int) -> None:
+    replay, units = Replay(capacity, 2, 1), np.cumsum(steps).tolist()
+    for number, unit in enumerate(units):
+        add(replay, number, unit)
+    kept = list(enumerate(units))[-capacity:]
+    wanted = {number for number, unit in kept if unit >= since}
+    assert replay.count_since(since) == len(wanted)
+    if wanted:
+        assert set(drawn(replay, since).reward) <= wanted
+    else:
+        with pytest.raises(ValueError, match="no transition to draw from"):
+            drawn(replay, since)
+
+
+def test_an_empty_replay_cannot_be_sampled() -> None:
+    replay = Replay(4, 2, 1)
+    assert replay.newest_unit == -1
+    with pytest.raises(ValueError, match="0 held"):
+        drawn(replay)
+
+
+def test_a_unit_that_goes_back_is_raised_and_counted() -> None:
+    replay = Replay(8, 2, 1)
+    for number, unit in enumerate([3, 5, 2, 6]):
+        add(replay, number, unit)
+    assert replay.raised_units == 1
+    assert set(drawn(replay, since_unit=5).reward) == {1, 2, 3}
+
+
+def test_equal_seeds_draw_equal_batches() -> None:
+    replay = Replay(100, 2, 1)
+    for number in range(50):
+        add(replay, number, 0)
+    np.testing.assert_array_equal(drawn(replay).reward, drawn(replay).reward)
+
+
+def test_the_content_hash_is_of_what_is_held() -> None:
+    wrapped, straight = Replay(3, 2, 1), Replay(5, 2, 1)
+    for number in range(5):
+        add(wrapped, number, number)
+    for number in range(2, 5):
+        add(straight, number, number)
+    assert wrapped.content_hash() == straight.content_hash()
+    add(straight, 5, 5)
+    assert wrapped.content_hash() != straight.content_hash()
+
+
+def test_a_replay_in_files_comes_back(tmp_path: Path) -> None:
+    replay = open_replay(tmp_path / "replay", 4, 2, 1)
+    for number in range(6):
+        add(replay, number, number)
+    replay.flush()
+    again = open_replay(tmp_path / "replay", 4, 2, 1)
+    assert again.content_hash() == replay.content_hash()
+    add(again, 6, 6)
+    assert set(drawn(again).reward) == {3, 4, 5, 6}
+
+
+def test_a_replay_that_was_never_flushed_starts_empty(tmp_path: Path) -> None:
+    add(open_replay(tmp_path, 4, 2, 1), 1, 1)
+    assert len(open_replay(tmp_path, 4, 2, 1)) == 0
+
+
+def test_a_replay_of_other_dimensions_is_refused(tmp_path: Path) -> None:
+    replay = open_replay(tmp_path, 4, 2, 1)
+    add(replay, 1, 1)
+    replay.flush()
+    with pytest.raises(ReplayError, match=r"capacity 4 \(wanted 8\), observation_dim 2 \(wanted 3\)$"):
+        open_replay(tmp_path, 8, 3, 1)
+
+
+def test_a_damaged_replay_is_refused(tmp_path: Path) -> None:
+    replay = open_replay(tmp_path, 4, 2, 1)
+    add(replay, 1, 1)
+    replay.flush()
+    (tmp_path / "reward.bin").unlink()
+    with pytest.raises(ReplayError, match=r"reward\.bin: missing"):
+        open_replay(tmp_path, 4, 2, 1)
+    (tmp_path / "cursor.json").write_text("{")
+    with pytest.raises(ReplayError, match="not readable"):
+        open_replay(tmp_path, 4, 2, 1)

@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from learner.algorithm import make_algorithm
+from learner.replay import Replay
+from learner.sac import Sac
+from rtcore.config import LearnerConfig
+from tests.learner.plain_sac import PlainSac, linears
+from tests.learner.small import ACTION_DIM, OBSERVATION_DIM, filled_replay, small_config
+
+
+def make_sac(config: LearnerConfig | None = None, replay: Replay | None = None, seed: int = 3) -> Sac:
+    if replay is None:
+        replay = filled_replay()
+    return Sac(config or small_config(), OBSERVATION_DIM, ACTION_DIM, seed, replay)
+
+
+def train(sac: Sac, updates: int, *, improve_policy: bool = True) -> None:
+    for _ in range(updates):
+        sac.update(improve_policy=improve_policy)
+
+
+@pytest.mark.parametrize("alpha", ["auto", 0.3])
+def test_it_is_plain_sac(alpha: float | str) -> None:
+    config = small_config(alpha=alpha, actor_lr=1e-2, critic_lr=2e-2, alpha_lr=3e-2, tau=0.05, gamma=0.9)
+    sac = make_sac(config)
+    plain = PlainSac(config, sac.state(), filled_replay())
+    for _ in range(5):
+        sac.update(improve_policy=True)
+        plain.update()
+        seen = sac.metrics()
+        assert {name: seen[name] for name in plain.losses} == pytest.approx(plain.losses, rel=1e-4, abs=1e-5)
+    tensors = sac.state().tensors
+    for index, name in enumerate(["trunk.0", "trunk.1", "heads"]):
+        wanted = linears(plain.actor)[index].weight.detach().numpy()
+        np.testing.assert_allclose(tensors[f"actor.{name}.weight"], wanted, rtol=1e-3, atol=1e-5)
+    for network, models in (("critic", plain.critics), ("target", plain.targets)):
+        for twin, model in enumerate(models):
+            wanted = linears(model)[1].weight.detach().numpy().T
+            np.testing.assert_allclose(tensors[f"{network}.1.weight"][twin], wanted, rtol=1e-3, atol=1e-5)
+    assert sac.metrics()["alpha"] == pytest.approx(
+        plain.log_alpha.exp().item() if alpha == "auto" else 0.3, rel=1e-5
+    )
+
+
+def test_a_paused_policy_keeps_every_bit() -> None:
+    sac = make_sac()
+    train(sac, 5)
+    before = sac.state()
+    train(sac, 5, improve_policy=False)
+    after = sac.state()
+    for name, value in before.tensors.items():
+        still = name.startswith(("actor.", "temperature."))
+        assert (after.tensors[name].tobytes() == value.tobytes()) is still, name
+    assert (sac.gradient_steps, sac.policy_steps) == (10, 5)
+
+
+def test_a_pause_does_not_change_which_batches_come() -> None:
+    paused, going = make_sac(), make_sac()
+    train(paused, 4, improve_policy=False)
+    train(going, 4)
+    assert paused.state().scalars["rng"]["batches"] == going.state().scalars["rng"]["batches"]
+
+
+def test_equal_seeds_give_equal_bits_and_others_do_not() -> None:
+    first, second, other = make_sac(seed=3), make_sac(seed=3), make_sac(seed=4)
+    assert first.policy_arrays()["mean.weight"].tobytes() != other.policy_arrays()["mean.weight"].tobytes()
+    for sac in (first, second, other):
+        train(sac, 20)
+    weights = [sac.policy_arrays() for sac in (first, second, other)]
+    for name, value in weights[0].items():
+        assert value.tobytes() == weights[1][name].tobytes()
+    assert weights[0]["mean.weight"].tobytes() != weights[2]["mean.weight"].tobytes()
+
+
+def test_only_the_newest_units_are_sampled() -> None:
+    replay = Replay(1000, OBSERVATION_DIM, ACTION_DIM)
+    zeros = np.zeros(OBSERVATION_DIM, np.float32), np.zeros(ACTION_DIM, np.float32)
+    for unit in range(10):
+        for _ in range(5):
+            replay.add(zeros[0], zeros[1], float(unit), zeros[0], False, unit)
+    sac = make_sac(small_config(replay_units=2.0, batch=200), replay)
+    sac.update(improve_policy=True)
+    assert set(sac._batch.reward) == {7, 8, 9}  # unit 9 is under way, and two whole ones
+
+
+def test_metrics_before_the_first_update() -> None:
+    assert make_sac().metrics() == {"alpha": 1.0}
+
+
+def test_a_fixed_temperature_has_no_loss() -> None:
+    sac = make_sac(small_config(alpha=0.2))
+    train(sac, 3)
+    assert sac.metrics().keys() == {"loss/critic", "loss/actor", "entropy", "q_mean", "alpha"}
+    assert sac.metrics()["alpha"] == pytest.approx(0.2)
+
+
+def test_the_temperature_falls_while_the_policy_is_more_random_than_asked() -> None:
+    eager, shy = make_sac(small_config(target_entropy=-50.0)), make_sac(small_config(target_entropy=50.0))
+    train(eager, 3)
+    train(shy, 3)
+    assert eager.metrics()["alpha"] < 1.0 < shy.metrics()["alpha"]
+
+
+def test_an_empty_replay_is_refused() -> None:
+    with pytest.raises(ValueError, match="no transition"):
+        make_sac(replay=Replay(10, OBSERVATION_DIM, ACTION_DIM)).update(improve_policy=True)
+
+
+def test_the_configuration_names_the_algorithm() -> None:
+    for algo in ("sac", "fsac"):
+        made = make_algorithm(small_config(algo=algo), OBSERVATION_DIM, ACTION_DIM, 0, filled_replay())
+        assert made.algo == algo
+        assert made.architecture.hidden == [16, 16]
+
+
+def mean_reward(sac: Sac, replay: Replay, rng: np.random.Generator, rounds: int) -> float:
+    """Act for `rounds` one-step episodes: the reward is highest at action 0.6 * observation."""
+    arrays, total = sac.policy_arrays(), 0.0
+    for _ in range(rounds):
+        observation = rng.uniform(-1, 1, 1).astype(np.float32)
+        hidden = observation
+        for layer in ("trunk.0", "trunk.1"):
+            hidden = np.maximum(arrays[f"{layer}.weight"] @ hidden + arrays[f"{layer}.bias"], 0)
+        mean = arrays["mean.weight"] @ hidden + arrays["mean.bias"]
+        log_std = np.clip(arrays["log_std.weight"] @ hidden + arrays["log_std.bias"], -20, 2)
+        action = np.tanh(mean + np.exp(log_std) * rng.standard_normal(1)).astype(np.float32)
+        reward = -float((action[0] - 0.6 * observation[0]) ** 2)
+        replay.add(observation, action, reward, observation, True, 0)
+        total += reward
+    return total / rounds
+
+
+@pytest.mark.parametrize("algo", ["sac", "fsac"])
+def test_it_learns(algo: str) -> None:
+    config = small_config(algo=algo, alpha=0.01, actor_lr=5e-3, critic_lr=5e-3, hidden=(32, 32), batch=64)
+    rng, replay = np.random.default_rng(0), Replay(5000, 1, 1)
+    student = make_algorithm(config, 1, 1, 0, replay)
+    assert isinstance(student, Sac)
+    untrained = mean_reward(student, replay, rng, 200)
+    for _ in range(10):
+        train(student, 40)
+        mean_reward(student, replay, rng, 20)
+    assert untrained < -0.2
+    assert mean_reward(student, replay, rng, 200) > -0.03
