@@ -1,0 +1,127 @@
+"""What a viewer opens with: the blueprint that is embedded in every recording.
+
+Left, what the robot does and what was said; middle, whether it does it well; right, whether it does it
+in time and on which policy. A recording shows the whole run, a live view the last half minute.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recorder.scene import ROOT
+from recorder.telemetry import FORECAST
+from rtcore.messages import Spec
+
+LIVE_WINDOW_S = 30.0
+SHOWN_LEVELS = ["INFO", "WARN", "ERROR"]  # DEBUG lines are in the recording, one click away
+BACKGROUND = [24, 26, 30]
+
+
+def dashboard(spec: Spec, followed: str, *, drift_is_speed: bool, live: bool = False) -> rrb.Blueprint:
+    """The layout.
+
+    Args:
+        spec: names the environment and its deadline in the titles.
+        followed: entity that the camera follows; empty: no 3-D.
+        drift_is_speed: whether `/env/drift` is a target speed.
+        live: follow the end of a running stream instead of showing everything.
+    """
+    plots = _Plots(live)
+    columns: list[Any] = [
+        _left(spec, followed),
+        rrb.Vertical(*_middle(plots, drift_is_speed=drift_is_speed), row_shares=[0.8, 2, 2, 2]),
+        rrb.Vertical(*_right(plots, spec), row_shares=[2, 0.8, 2, 2]),
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(*columns, column_shares=[1, 1, 1]),
+        rrb.TimePanel(state="collapsed", timeline="run_time", play_state="following"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _left(spec: Spec, followed: str) -> Any:
+    card = rrb.TextDocumentView(origin="/run_card", name="Run card")
+    log = rrb.TextLogView(
+        origin="/log",
+        name="Log of all processes",
+        rows=rrb.TextLogRows(filter_by_log_level=SHOWN_LEVELS),
+        columns=rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["LogLevel", "Body"]),
+    )
+    if not followed:
+        return rrb.Vertical(card, log, row_shares=[1, 1])
+    camera = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital, position=(0, -3.2, 0.9), look_target=(0, 0, 0), tracking_entity=followed
+    )
+    world = rrb.Spatial3DView(
+        origin=ROOT,
+        name=f"World: {spec.env_id}",
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.5),
+        eye_controls=camera,
+    )
+    return rrb.Vertical(world, rrb.Tabs(log, card), row_shares=[3, 2])
+
+
+def _middle(plots: _Plots, *, drift_is_speed: bool) -> list[Any]:
+    return [
+        plots.states("Learner's phase", "/learner/phase"),
+        plots.lines("Drifting target and speed reached, m/s", "/env/drift", legend=True)
+        if drift_is_speed
+        else plots.lines("Drift", "/env/drift"),
+        plots.lines("Return per episode", "/env/return"),
+        plots.lines("Reward per tick", "/env/reward"),
+    ]
+
+
+def _right(plots: _Plots, spec: Spec) -> list[Any]:
+    latency = f"Latency, µs (deadline {spec.tick_ns / 1e3:,.0f})"
+    return [
+        plots.lines(latency, "/agent/loop_us", "/agent/reaction_us", "/env/pacing_us", legend=True),
+        plots.lines("Missed deadlines", "/agent/missed"),
+        plots.lines(
+            "Policy version", "/learner/published_version", "/agent/policy_version", legend=True
+        ),
+        rrb.Tabs(
+            plots.lines("Losses", "/learner/loss/**", legend=True),
+            plots.lines("Forecast", FORECAST, legend=True),
+            plots.lines("Mean Q", "/learner/q_mean"),
+            plots.lines("Temperature", "/learner/alpha"),
+            plots.lines("Entropy", "/learner/entropy"),
+            plots.lines("Updates per s", "/learner/updates_per_s"),
+        ),
+    ]
+
+
+class _Plots:
+    """Makes views over run time: of the whole run, or of its last half minute.
+
+    Their axes are not linked: a linked axis shows the half minute around the cursor, whatever range it is
+    given (rerun 0.41).
+    """
+
+    def __init__(self, live: bool) -> None:
+        window = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+        if live:
+            start = rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S)
+            window = rr.TimeRange(start=start, end=rr.TimeRangeBoundary.cursor_relative())
+        self._axis = rrb.TimeAxis(link="Independent", view_range=window)
+
+    def lines(self, name: str, *entities: str, legend: bool = False) -> rrb.TimeSeriesView:
+        """Scalars of some entities; a legend where the title does not say which series it is."""
+        return rrb.TimeSeriesView(
+            origin="/",
+            contents=[f"+ {entity}" for entity in entities],
+            name=name,
+            axis_x=self._axis,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        )
+
+    def states(self, name: str, entity: str) -> rrb.StateTimelineView:
+        """A state machine as a coloured lane."""
+        return rrb.StateTimelineView(origin="/", contents=[f"+ {entity}"], name=name, time_view=self._axis)

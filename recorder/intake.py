@@ -1,0 +1,96 @@
+"""What the recorder hears: the env server's log, everybody's stats, the learner's phases and policies."""
+
+from __future__ import annotations
+
+from recorder.telemetry import TelemetryRows
+from rtcore import channels
+from rtcore.bus import Bus
+from rtcore.messages import Spec, Stats, Step
+from rtcore.stream import StepStream
+
+LOG_CAPACITY = 2_000  # batches: 100 s of a recorder that hangs, 50 MB at 1 kHz
+STATS_CAPACITY = 2_000
+POLICY_CAPACITY = 64  # a few hundred kB each
+WINDOW_CAPACITY = 2_000
+PATIENCE_NS = 5_000_000_000  # a missing step is waited for so long; the bus recovers one within 2 s
+
+
+class Intake:
+    """Drains the bus into steps and telemetry, and counts what got lost on the way."""
+
+    def __init__(self, bus: Bus, env: str, telemetry: TelemetryRows) -> None:
+        self._specs = bus.latest(channels.SPEC, env)
+        self._batches = bus.queue(channels.LOG, env, capacity=LOG_CAPACITY)
+        self._stats = bus.queue(channels.STATS, "*", capacity=STATS_CAPACITY)
+        self._notices = bus.queue(channels.WINDOW, capacity=WINDOW_CAPACITY)
+        self._policies = bus.queue(channels.POLICY, capacity=POLICY_CAPACITY)
+        self._telemetry = telemetry
+        self._stream = StepStream()
+        self._waiting_since_ns: int | None = None  # a step is missing since then
+        self._speaking: set[str] = set()  # processes heard whose final stats are still to come
+        self.placements: dict[str, str] = {}  # process -> what the system granted it
+
+    @property
+    def gaps(self) -> int:
+        """Steps that never came. A batch lost to a full queue shows here, by its steps."""
+        return self._stream.gaps
+
+    @property
+    def dropped(self) -> int:
+        """Steps that never came, and other messages lost to a full queue."""
+        others = self._stats.dropped + self._notices.dropped + self._policies.dropped
+        return self.gaps + others
+
+    @property
+    def complete(self) -> bool:
+        """The env server has ended in order, and everybody heard has sent final stats."""
+        return self._stream.ended and not self._speaking
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for steps, at most so long."""
+        self._batches.wait(timeout_s)
+
+    def take_spec(self) -> Spec | None:
+        """The env server's declaration, if it is new."""
+        received = self._specs.take()
+        return received.message if received is not None else None
+
+    def take_steps(self, now_ns: int) -> list[Step]:
+        """New steps in order, each once; those behind a missing one come when it does, or 5 s later."""
+        steps: list[Step] = []
+        for received in self._batches.drain():
+            steps += self._stream.feed(received.message)
+        if not self._stream.waiting:
+            self._waiting_since_ns = None
+        elif self._waiting_since_ns is None or steps:
+            self._waiting_since_ns = now_ns
+        elif now_ns - self._waiting_since_ns >= PATIENCE_NS:
+            self._waiting_since_ns = now_ns
+            steps += self._stream.give_up()
+        return steps
+
+    def give_up_on_gaps(self) -> list[Step]:
+        """The steps that still waited for earlier ones; those now count as lost."""
+        return self._stream.flush()
+
+    def take_telemetry(self) -> int:
+        """Pass on stats, phases and policies; returns how many messages there were."""
+        notices, policies, stats = self._notices.drain(), self._policies.drain(), self._stats.drain()
+        for notice in notices:
+            self._telemetry.window(notice.message)
+        for policy in policies:
+            self._telemetry.policy(policy.message)
+        for message in stats:
+            self._take_stats(message.message)
+        return len(notices) + len(policies) + len(stats)
+
+    def _take_stats(self, stats: Stats) -> None:
+        self._telemetry.stats(stats)
+        if stats.final:
+            self._speaking.discard(stats.process)
+        elif stats.process != channels.RECORDER:
+            self._speaking.add(stats.process)
+        prefix = f"{stats.process}: "  # every process's first event: its scheduling and cores
+        for event in stats.events:
+            if event.text.startswith(prefix):
+                self.placements[stats.process] = event.text.removeprefix(prefix)

@@ -1,0 +1,134 @@
+"""What is written: rows of an entity, on the recording's timelines. Pure, knows no file format.
+
+Every row stands on all five timelines: `run_time` (ns since T0), `wall` (Unix ns), `tick`, `episode`
+and `unit`. A step brings its own tick, episode and unit; for anything else they follow from the time.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtcore.messages import Spec, Step
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Index:
+    """Where n rows stand on the timelines; int64 [n] each."""
+
+    run_time_ns: Ints  # since T0; negative before it
+    wall_ns: Ints  # Unix time
+    tick: Ints
+    episode: Ints
+    unit: Ints
+
+    def __len__(self) -> int:
+        return len(self.run_time_ns)
+
+    def where(self, mask: NDArray[np.bool_]) -> Index:
+        """The rows where `mask` (bool [n]) is true."""
+        return Index(
+            self.run_time_ns[mask], self.wall_ns[mask], self.tick[mask], self.episode[mask], self.unit[mask]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Scalars:
+    """float64 [n, k]: k series; NaN draws a gap."""
+
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """n names; each lasts until the next."""
+
+    names: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """n log lines with their levels."""
+
+    texts: Sequence[str]
+    levels: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """World pose of one body: metres, float32 [n, 3]; rotation, float32 [n, 4] as xyzw (None: not turned)."""
+
+    translation: Singles
+    quaternion: Singles | None = None
+
+
+Payload = Scalars | States | Lines | Poses
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """n rows of one entity."""
+
+    entity: str
+    index: Index
+    payload: Payload
+
+
+class Timeline:
+    """Turns monotonic stamps into places on the five timelines.
+
+    T0 is the first env server's: the timeline goes on when an env server comes back with a later one.
+    """
+
+    def __init__(self, spec: Spec) -> None:
+        self._t0_ns = spec.t0_ns
+        self._wall_t0_ns = spec.wall_t0_ns
+        self._tick_ns = spec.tick_ns
+        self._unit_ns = spec.unit_ns
+        self._episode_starts_ns: list[int] = []  # run time of each episode's first step seen, rising
+        self._episodes: list[int] = []
+
+    def remember(self, steps: Sequence[Step]) -> None:
+        """Learn where episodes begin, from steps in order."""
+        for step in steps:
+            if not self._episodes or step.episode != self._episodes[-1]:
+                self._episodes.append(step.episode)
+                self._episode_starts_ns.append(step.due_ns - self._t0_ns)
+
+    def of_steps(self, steps: Sequence[Step]) -> Index:
+        """At their deadlines, with their own tick, episode and unit."""
+        run_time = np.array([step.due_ns for step in steps], np.int64) - self._t0_ns
+        return Index(
+            run_time,
+            run_time + self._wall_t0_ns,
+            np.array([step.tick for step in steps], np.int64),
+            np.array([step.episode for step in steps], np.int64),
+            np.array([step.unit for step in steps], np.int64),
+        )
+
+    def of_stamps(self, at_ns: Sequence[int]) -> Index:
+        """At any instants: tick = floor(run_time / dt), unit likewise, episode of the newest step until then.
+
+        Before T0 all three are 0.
+        """
+        run_time = np.array(at_ns, np.int64) - self._t0_ns
+        since_t0 = np.maximum(run_time, 0)
+        return Index(
+            run_time,
+            run_time + self._wall_t0_ns,
+            since_t0 // self._tick_ns,
+            np.array([self._episode_at(at) for at in run_time.tolist()], np.int64),
+            since_t0 // self._unit_ns,
+        )
+
+    def _episode_at(self, run_time_ns: int) -> int:
+        place = bisect_right(self._episode_starts_ns, run_time_ns) - 1
+        return self._episodes[place] if place >= 0 else 0

@@ -1,0 +1,90 @@
+"""How series look. Kept in the data, not in the dashboard: any layout then has the same looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import rerun as rr
+
+from recorder.telemetry import FORECAST
+
+BLUE, ORANGE, GREEN = 0x4E9BFFFF, 0xFFA23AFF, 0x3ECF8EFF
+RED, PURPLE, GREY = 0xFF5A5FFF, 0xB18CFFFF, 0x9AA4B2FF
+PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
+
+Drawing = Literal["Average", "Max", "Steps", "Dots"]
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Names and colours of an entity's series, and what zooming out may do to them.
+
+    `Average` is for quantities whose mean matters. `Max` is for latencies and misses: the default
+    would draw a single spike at half its height (measured). `Steps` holds a value until the next one.
+    """
+
+    names: tuple[str, ...]
+    colours: tuple[int, ...]
+    drawing: Drawing = "Average"
+    width: float = 1.5
+
+
+LOOKS: dict[str, Look] = {
+    "/env/reward": Look(("reward",), (BLUE,), width=1.0),
+    "/env/return": Look(("return",), (GREEN,), "Dots"),
+    "/env/pacing_us": Look(("pacing error",), (GREY,), "Max"),
+    "/agent/loop_us": Look(("loop",), (ORANGE,), "Max"),
+    "/agent/reaction_us": Look(("agent's reaction",), (BLUE,), "Max"),
+    "/agent/missed": Look(("missed",), (RED,), "Max"),
+    "/agent/policy_version": Look(("acting",), (ORANGE,), "Steps"),
+    "/learner/published_version": Look(("published",), (BLUE,), "Steps"),
+    "/learner/loss/critic": Look(("critic",), (BLUE,)),
+    "/learner/loss/actor": Look(("actor",), (ORANGE,)),
+    "/learner/loss/alpha": Look(("temperature",), (PURPLE,)),
+    "/learner/alpha": Look(("temperature alpha",), (PURPLE,)),
+    "/learner/entropy": Look(("entropy",), (GREEN,)),
+    "/learner/q_mean": Look(("mean Q",), (GREEN,)),
+    "/learner/updates_per_s": Look(("updates per s",), (GREY,)),
+}
+TARGET = Look(("target",), (ORANGE,), "Steps", width=2.5)
+TARGET_AND_SPEED = Look(("target", "reached"), (ORANGE, BLUE), width=1.5)
+
+
+def looks(look: Look) -> list[rr.AsComponents]:
+    """The static archetypes of a look."""
+    lines = rr.SeriesLines(
+        names=list(look.names),
+        colors=np.array(look.colours, np.uint32),
+        widths=[look.width] * len(look.names),
+        aggregation_policy="Max" if look.drawing == "Max" else "Average",
+        interpolation_mode="StepAfter" if look.drawing == "Steps" else "Linear",
+    )
+    if look.drawing != "Dots":
+        return [lines]
+    dots = rr.SeriesPoints(
+        names=list(look.names), colors=np.array(look.colours, np.uint32), markers="Circle", marker_sizes=[3.0]
+    )
+    return [lines, dots]
+
+
+def forecast_look(names: Sequence[str]) -> Look:
+    """The forecast's gauges, in the order in which they turned up."""
+    return Look(tuple(names), tuple(PALETTE[i % len(PALETTE)] for i in range(len(names))))
+
+
+def static_looks(*, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:
+    """Everything that can be said before the first row; `FORECAST` follows when its series are known."""
+    static = {entity: looks(look) for entity, look in LOOKS.items()}
+    static["/env/drift"] = looks(TARGET_AND_SPEED if drift_is_speed else TARGET)
+    static["/learner/phase"] = [
+        rr.StateConfiguration(
+            values=["update", "hold"],
+            labels=["update", "hold"],
+            colors=np.array([BLUE, ORANGE], np.uint32),
+        )
+    ]
+    assert FORECAST not in static
+    return static

@@ -1,0 +1,108 @@
+"""From stats, phases and policies to rows: what the learner did and what everybody said. Pure.
+
+Messages may come twice (retained ones, and phases that stats repeat); each counts once.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from recorder.rows import Lines, Rows, Scalars, States, Timeline
+from rtcore.channels import LEARNER
+from rtcore.messages import Level, Policy, Stats, WindowNotice
+
+FORECAST = "/learner/forecast"
+
+
+class TelemetryRows:
+    """Collects messages, and gives their rows when asked: by then the steps before them are known."""
+
+    def __init__(self) -> None:
+        self._lines: list[tuple[int, Level, str]] = []
+        self._gauges: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
+        self._forecasts: list[tuple[int, dict[str, float]]] = []
+        self._phases: list[tuple[int, str]] = []
+        self._versions: list[tuple[int, int]] = []
+        self._stats_seen: dict[tuple[str, int], set[int]] = defaultdict(set)
+        self._notices_seen: set[WindowNotice] = set()
+        self._versions_seen: set[tuple[int, int]] = set()
+        self.forecast_names: list[str] = []  # series of `FORECAST`, in the order of the row; grows
+
+    def stats(self, stats: Stats) -> None:
+        """Take a ledger: its events, the learner's gauges, and phases whose notice was lost."""
+        seen = self._stats_seen[stats.process, stats.incarnation]
+        if stats.seq in seen:
+            return
+        seen.add(stats.seq)
+        prefix = f"{stats.process}: "  # some name themselves
+        for event in stats.events:
+            self.line(event.at_ns, event.level, f"[{stats.process}] {event.text.removeprefix(prefix)}")
+        for notice in stats.windows:
+            self.window(notice)
+        if stats.process == LEARNER:
+            self._take_gauges(stats)
+
+    def window(self, notice: WindowNotice) -> None:
+        """Take the start of a phase."""
+        if notice in self._notices_seen:
+            return
+        self._notices_seen.add(notice)
+        self._phases.append((notice.at_ns, notice.phase))
+        if notice.reason == "operator":
+            what = "holds the policy" if notice.phase == "hold" else "resumes the schedule"
+            self._lines.append((notice.at_ns, "INFO", f"[operator] {what} in window {notice.window}"))
+
+    def policy(self, policy: Policy) -> None:
+        """Take a published iterate."""
+        key = (policy.version, policy.created_ns)
+        if key not in self._versions_seen:
+            self._versions_seen.add(key)
+            self._versions.append((policy.created_ns, policy.version))
+
+    def line(self, at_ns: int, level: Level, text: str) -> None:
+        """Take a line for the log."""
+        self._lines.append((at_ns, level, text))
+
+    def rows(self, timeline: Timeline) -> list[Rows]:
+        """Everything taken since the last call."""
+        tables: list[Rows] = []
+        if self._lines:
+            at_ns, levels, texts = zip(*self._lines, strict=True)
+            tables.append(Rows("/log", timeline.of_stamps(at_ns), Lines(texts, levels)))
+        if self._phases:
+            at_ns, names = zip(*self._phases, strict=True)
+            tables.append(Rows("/learner/phase", timeline.of_stamps(at_ns), States(names)))
+        if self._versions:
+            tables.append(_scalar_rows("/learner/published_version", self._versions, timeline))
+        tables += [_scalar_rows(entity, points, timeline) for entity, points in self._gauges.items()]
+        if self._forecasts:
+            tables.append(self._forecast_rows(timeline))
+        for pending in (self._lines, self._phases, self._versions, self._gauges, self._forecasts):
+            pending.clear()
+        return tables
+
+    def _take_gauges(self, stats: Stats) -> None:
+        forecasts: dict[str, float] = {}
+        for name, value in stats.gauges.items():
+            if name.startswith("forecast/"):
+                forecasts[name.removeprefix("forecast/")] = value
+            else:
+                self._gauges[f"/learner/{name}"].append((stats.at_ns, value))
+        if forecasts:
+            self._forecasts.append((stats.at_ns, forecasts))
+            self.forecast_names += sorted(forecasts.keys() - set(self.forecast_names))
+
+    def _forecast_rows(self, timeline: Timeline) -> Rows:
+        index = timeline.of_stamps([at_ns for at_ns, _ in self._forecasts])
+        nan = float("nan")
+        values = [[row.get(name, nan) for name in self.forecast_names] for _, row in self._forecasts]
+        return Rows(FORECAST, index, Scalars(np.array(values, np.float64)))
+
+
+def _scalar_rows(
+    entity: str, points: list[tuple[int, float]] | list[tuple[int, int]], timeline: Timeline
+) -> Rows:
+    index = timeline.of_stamps([at_ns for at_ns, _ in points])
+    return Rows(entity, index, Scalars(np.array([[value] for _, value in points], np.float64)))
