@@ -1,0 +1,1 @@
+"""Named run configurations and the experiments that are built on them."""

@@ -1,0 +1,1 @@
+"""The `tenuto` command: starts, supervises, inspects and stops the processes of a run."""

@@ -1,0 +1,114 @@
+"""`tenuto status|hold|resume|stop`: orders to a system that runs."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.text import Text
+
+from launcher import drawing
+from launcher.cli import DONE, CommandError
+from launcher.parsing import parse
+from launcher.run import RUNS
+from rtcore import channels
+from rtcore.bus import Bus, BusError, NoAnswerError
+from rtcore.config import ConfigError
+from rtcore.messages import Command, CommandReply
+from rtcore.monotonic import MonotonicClock
+from rtcore.run_dir import RunDir, latest
+from rtcore.zenoh_bus import open_bus
+
+Verb = Literal["hold", "resume", "status", "stop"]
+
+
+@dataclass(frozen=True)
+class ControlOptions:
+    """Which run."""
+
+    run_dir: Path | None = None
+    """The run directory. None: the newest one in runs/."""
+
+
+def status(argv: Sequence[str]) -> int:
+    """`tenuto status`."""
+    run_dir = _run_dir(argv, "status", "What each process of a run is doing.")
+    rows: list[tuple[str, Text | str]] = []
+    answered = 0
+    with _joined(run_dir) as bus:
+        for process in channels.PROCESSES:
+            try:
+                reply = _ask(bus, process, "status")
+            except NoAnswerError:
+                rows.append((process, Text("does not answer", style="yellow")))
+            else:
+                answered += 1
+                rows.append((process, reply.text))
+    if not answered:
+        raise _silence(run_dir)
+    console = Console()
+    console.print(f"run  {run_dir.path}", highlight=False, soft_wrap=True)
+    console.print(drawing.pairs(rows))
+    return DONE
+
+
+def hold(argv: Sequence[str]) -> int:
+    """`tenuto hold`."""
+    return _order(argv, "hold", channels.LEARNER, "Hold the policy until `tenuto resume`; the critics go on.")
+
+
+def resume(argv: Sequence[str]) -> int:
+    """`tenuto resume`."""
+    return _order(argv, "resume", channels.LEARNER, "Go on with the schedule after `tenuto hold`.")
+
+
+def stop(argv: Sequence[str]) -> int:
+    """`tenuto stop`."""
+    description = "End the environment server in order; `tenuto run` then ends all the others."
+    return _order(argv, "stop", channels.ENV_SERVER, description)
+
+
+def _order(argv: Sequence[str], verb: Verb, process: str, description: str) -> int:
+    run_dir = _run_dir(argv, verb, description)
+    with _joined(run_dir) as bus:
+        try:
+            reply = _ask(bus, process, verb)
+        except NoAnswerError as error:
+            raise _silence(run_dir, process) from error
+    if not reply.ok:
+        raise CommandError(f"{process}: {reply.text}")
+    Console().print(f"{process}: {reply.text}", highlight=False, soft_wrap=True)
+    return DONE
+
+
+def _run_dir(argv: Sequence[str], command: str, description: str) -> RunDir:
+    options = parse(ControlOptions, argv, prog=f"tenuto {command}", description=description)
+    if options.run_dir is not None:
+        return RunDir.open(options.run_dir)
+    newest = latest(RUNS)
+    if newest is None:
+        raise ConfigError("run_dir", None, f"must be given: there is no run in {RUNS}/")
+    return newest
+
+
+@contextmanager
+def _joined(run_dir: RunDir) -> Iterator[Bus]:
+    try:
+        with open_bus("client", run_dir.run_name, run_dir.socket_dir(), clock=MonotonicClock()) as bus:
+            yield bus
+    except BusError as error:
+        raise CommandError(str(error)) from error
+
+
+def _ask(bus: Bus, process: str, verb: Verb) -> CommandReply:
+    return bus.ask(process, Command(id=uuid.uuid4().hex, verb=verb), timeout_s=1.0, tries=3)
+
+
+def _silence(run_dir: RunDir, process: str = "") -> CommandError:
+    who = f"{process} does not answer" if process else "nothing answers"
+    return CommandError(f"{who} in {run_dir.path}: is the run still going?")

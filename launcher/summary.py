@@ -1,0 +1,199 @@
+"""`summary.json`: what a run did, from its configuration and the ledgers of its processes. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+from typing import Any
+
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
+from rtcore.config import RunConfig
+from rtcore.histogram import Histogram
+from rtcore.messages import Stats, WindowNotice
+
+SCHEMA = 1
+FATES = ("adopted", "rejected", "superseded", "unused", "unreceived")  # of a published policy
+CAUSES = ("agent_late", "agent_absent", "env_late")
+
+Summary = dict[str, Any]
+StatsByProcess = Mapping[str, Sequence[Stats]]  # per process: the newest ledger of each incarnation
+
+
+@dataclass
+class Totals:
+    """One process's ledgers, added up over its incarnations."""
+
+    counters: Counter[str] = field(default_factory=Counter)
+    gauges: dict[str, float] = field(default_factory=dict)  # of the newest incarnation that has them
+    histograms: dict[str, Histogram] = field(default_factory=dict)
+    returns: list[float] = field(default_factory=list)  # in the order of the episodes
+    windows: list[WindowNotice] = field(default_factory=list)
+
+    def quantiles(self, name: str, scale: float) -> dict[str, float | None]:
+        """{p50, p99, p999, max} of a histogram in ns, times `scale`; None where nothing was recorded."""
+        return self.histograms.get(name, Histogram()).summary(scale)
+
+
+def add_up(incarnations: Sequence[Stats]) -> Totals:
+    """One process's totals."""
+    total = Totals()
+    for ledger in sorted(incarnations, key=lambda one: one.incarnation):
+        total.counters.update(ledger.counters)
+        total.gauges.update(ledger.gauges)
+        total.windows.extend(ledger.windows)
+        total.returns.extend(one.value for one in sorted(ledger.returns, key=lambda one: one.episode))
+        for name, data in ledger.histograms.items():
+            total.histograms.setdefault(name, Histogram()).merge(Histogram.from_bytes(data))
+    return total
+
+
+def summarise(
+    config: RunConfig,
+    run: str,
+    stats: StatsByProcess,
+    *,
+    wall_s: float,
+    restarts: Mapping[str, int],
+    ended: str = "",
+    forced: Sequence[str] = (),
+) -> Summary:
+    """The whole summary.
+
+    Args:
+        config: the run's, resolved (`env.hz` is known).
+        run: the run's name.
+        stats: every process's ledgers; a process may be absent.
+        wall_s: seconds from the start of the first process to the end of the last.
+        restarts: how often each process was started again.
+        ended: why the run ended, in a few words.
+        forced: processes that had to be killed at the end.
+    """
+    totals = {process: add_up(stats.get(process, ())) for process in PROCESSES}
+    env, learner, recorder = totals[ENV_SERVER], totals[LEARNER], totals[RECORDER]
+    ticks = env.counters["ticks"]
+    return {
+        "schema": SCHEMA,
+        "run": run,
+        "preset": config.preset,
+        "env": config.env.id,
+        "algo": config.learner.algo,
+        "seed": config.seed,
+        "tick_hz": config.env.hz,
+        "unit_s": config.env.unit_s,
+        "wall_s": wall_s,
+        "ended": ended,
+        "forced": list(forced),
+        "ticks": ticks,
+        "resets": env.counters["resets"],
+        "episodes": env.counters["episodes"],
+        "mean_return": fmean(env.returns) if env.returns else None,
+        "returns": env.returns,
+        "deadlines": _deadlines(env),
+        "pacing_error_us": env.quantiles("pacing", 1e-3),
+        "reaction_us": totals[AGENT].quantiles("reaction", 1e-3),
+        "loop_us": env.quantiles("loop", 1e-3),
+        "policies": _policies(learner, totals[AGENT]),
+        "windows": _windows(learner.windows),
+        "operator_holds": sum(one.reason == "operator" and one.phase == "hold" for one in learner.windows),
+        "transitions": _transitions(env, learner),
+        "learner": _learner(learner, _run_time_s(env, config)),
+        "forecast": _forecast(learner.gauges),
+        "recorder": {"rows": recorder.counters["rows"], "dropped": recorder.counters["dropped"]},
+        "restarts": {process: restarts.get(process, 0) for process in PROCESSES},
+        "messages": {"rejected": sum(total.counters["messages.rejected"] for total in totals.values())},
+    }
+
+
+def discrepancies(summary: Summary) -> list[str]:
+    """What does not reconcile, each as an equation that fails; empty when everything does."""
+    transitions, policies = summary["transitions"], summary["policies"]
+    fates = sum(policies[name] for name in FATES)
+    pairs = [
+        ("ticks = produced + resets", summary["ticks"], transitions["produced"] + summary["resets"]),
+        ("produced = learned + lost", transitions["produced"], transitions["learned"] + transitions["lost"]),
+        ("published = " + " + ".join(FATES), policies["published"], fates),
+        (
+            "missed = sum of its causes",
+            summary["deadlines"]["missed"],
+            sum(summary["deadlines"]["missed_by_cause"].values()),
+        ),
+    ]
+    return [f"{equation}: {left} != {right}" for equation, left, right in pairs if left != right]
+
+
+def _deadlines(env: Totals) -> Summary:
+    missed, ticks = env.counters["missed"], env.counters["ticks"]
+    prefix = "missed."
+    found = {name.removeprefix(prefix): n for name, n in env.counters.items() if name.startswith(prefix)}
+    return {
+        "missed": missed,
+        "miss_ratio": missed / ticks if ticks else None,
+        "overruns": env.counters["overruns"],
+        "skipped": env.counters["skipped"],
+        "missed_by_cause": dict.fromkeys(CAUSES, 0) | found,
+    }
+
+
+def _policies(learner: Totals, agent: Totals) -> Summary:
+    """Every published policy has one of the `FATES`. `unused`: ready when the agent ended; `unreceived`:
+    no agent lived to get it. The last one of a run often has one of these two.
+    """
+    published, received = learner.counters["published"], agent.counters["policies.received"]
+    latency = agent.quantiles("publish_to_adopt", 1e-6)
+    return {
+        "published": published,
+        "adopted": agent.counters["policies.adopted"],
+        "rejected": agent.counters["policies.rejected"],
+        "superseded": agent.counters["policies.superseded"],
+        "unused": agent.counters["policies.unused"],
+        "unreceived": published - received,
+        "published_in_hold": learner.counters["published_in_hold"],
+        "withheld": learner.counters["withheld"],
+        "last_version": learner.counters["last_version"],
+        "publish_to_adopt_ms": {name: latency[name] for name in ("p50", "p99", "max")},
+    }
+
+
+def _windows(notices: Iterable[WindowNotice]) -> list[Summary]:
+    """One row per window; its phases, and operators' holds, are several notices."""
+    rows = {
+        one.window: {"m": one.window, "t_m": one.start_unit, "G": one.update_units, "N": one.hold_units}
+        for one in notices
+    }
+    return [rows[window] for window in sorted(rows)]
+
+
+def _transitions(env: Totals, learner: Totals) -> Summary:
+    produced, learned = env.counters["produced"], learner.counters["learned"]
+    return {
+        "produced": produced,
+        "learned": learned,
+        "lost": produced - learned,
+        "duplicate": learner.counters["duplicate"],
+    }
+
+
+def _learner(learner: Totals, run_time_s: float) -> Summary:
+    steps = learner.counters["gradient_steps"]
+    return {
+        "gradient_steps": steps,
+        "policy_steps": learner.counters["policy_steps"],
+        "updates_per_s": steps / run_time_s if run_time_s else None,
+    }
+
+
+def _run_time_s(env: Totals, config: RunConfig) -> float:
+    """Seconds of run time that were ticked through or skipped."""
+    return (env.counters["ticks"] + env.counters["skipped"]) / config.env.hz if config.env.hz else 0.0
+
+
+def _forecast(gauges: Mapping[str, float]) -> Summary:
+    """None where no forecast was judged."""
+    windows = gauges.get("forecast/windows")
+    return {
+        "windows": None if windows is None else int(windows),
+        "error": gauges.get("forecast/error"),
+        "baseline_error": gauges.get("forecast/baseline_error"),
+    }

@@ -1,0 +1,104 @@
+"""What the launcher knows of a running system: the newest ledgers, rates, and what was said. No I/O."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from launcher.summary import StatsByProcess, Totals, add_up
+from rtcore import channels
+from rtcore.health import Health, health
+from rtcore.messages import EpisodeReturn, Event, Stats, WindowNotice
+
+RATE_SPAN_NS = 2_000_000_000  # long enough that four messages a second make a steady figure
+EVENTS_KEPT = 200
+RETURNS_SHOWN = 60
+
+
+@dataclass
+class _Incarnation:
+    """One life of one process."""
+
+    newest: Stats
+    returns: dict[int, EpisodeReturn] = field(
+        default_factory=dict
+    )  # by episode: each message has the last 64
+
+    def whole(self) -> Stats:
+        """The newest ledger with all returns that were ever seen."""
+        return msgspec.structs.replace(
+            self.newest, returns=[self.returns[episode] for episode in sorted(self.returns)]
+        )
+
+
+class Watch:
+    """Folds Stats messages, in whatever order they come."""
+
+    def __init__(self, hz: float) -> None:
+        self._hz = hz
+        self._lives: dict[tuple[str, int], _Incarnation] = {}
+        self._seen_ns: dict[str, int] = {}
+        self._recent: dict[str, deque[Stats]] = {}
+        self.events: deque[tuple[str, Event]] = deque(maxlen=EVENTS_KEPT)
+
+    def feed(self, stats: Stats, received_ns: int) -> None:
+        """Take in one message, received at `received_ns` on this process's clock."""
+        key = (stats.process, stats.incarnation)
+        life = self._lives.setdefault(key, _Incarnation(stats))
+        if stats.seq >= life.newest.seq:
+            life.newest = stats
+        life.returns.update({one.episode: one for one in stats.returns})
+        self.events.extend((stats.process, event) for event in stats.events)
+        self._seen_ns[stats.process] = received_ns
+        recent = self._recent.setdefault(stats.process, deque())
+        if recent and recent[-1].incarnation != stats.incarnation:
+            recent.clear()
+        recent.append(stats)
+        while len(recent) > 2 and stats.at_ns - recent[1].at_ns >= RATE_SPAN_NS:
+            recent.popleft()
+
+    def feed_final(self, stats: Iterable[Stats]) -> None:
+        """Take in what the processes wrote at their ends: nothing is missing from it."""
+        for one in stats:
+            self._lives[(one.process, one.incarnation)] = _Incarnation(
+                one, {episode.episode: episode for episode in one.returns}
+            )
+
+    def stats(self) -> StatsByProcess:
+        """The newest ledger of each incarnation, for the summary."""
+        found: dict[str, list[Stats]] = {}
+        for (process, _), life in sorted(self._lives.items()):
+            found.setdefault(process, []).append(life.whole())
+        return found
+
+    def totals(self, process: str) -> Totals:
+        """One process's ledgers added up; empty before its first message."""
+        return add_up([life.whole() for (name, _), life in self._lives.items() if name == process])
+
+    def rate(self, process: str, counter: str) -> float | None:
+        """A counter's rise per second over the last two seconds; None before two messages came."""
+        recent = self._recent.get(process)
+        if recent is None or len(recent) < 2:
+            return None
+        first, last = recent[0], recent[-1]
+        span_s = (last.at_ns - first.at_ns) / 1e9
+        if span_s <= 0:
+            return None
+        return (last.counters.get(counter, 0) - first.counters.get(counter, 0)) / span_s
+
+    def health(self, process: str, now_ns: int) -> Health:
+        """By the stats channel's row: how long ago the process last spoke."""
+        return health(channels.STATS, self._hz, self._seen_ns.get(process), now_ns)
+
+    def ended(self, process: str) -> bool:
+        """Whether its newest incarnation said that it ended in order."""
+        recent = self._recent.get(process)
+        return recent is not None and recent[-1].final
+
+    def phase(self) -> WindowNotice | None:
+        """The phase that the learner entered last."""
+        windows = self._recent[channels.LEARNER][-1].windows if channels.LEARNER in self._recent else []
+        return windows[-1] if windows else None

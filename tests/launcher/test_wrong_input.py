@@ -1,0 +1,97 @@
+"""Every mistake is one line that names the field, its value and what is allowed; nothing is left behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.launcher.commands import tenuto, tree
+
+BAD_TOML = "[env]\nhz = = 3\n"
+UNKNOWN_KEY = "[env]\nherz = 100.0\n"
+WRONG_RANGE = "[learner.schedule]\ngamma_f = 2.0\n"
+
+CASES = {
+    "command": (["rum"], ["command", "'rum'", "run, sim"]),
+    "preset": (["run", "cheetah"], ["preset", "'cheetah'", "halfcheetah, "]),
+    "preset_and_config": (["run", "gym", "--config", "good.toml"], ["config", "good.toml", "'gym'"]),
+    "env_id": (["run", "gym", "--env.id", "Nowhere-v5"], ["env.id", "'Nowhere-v5'"]),
+    "discrete_actions": (["run", "gym", "--env.id", "CartPole-v1"], ["env.id", "'CartPole-v1'"]),
+    "gamma_f_0": (["run", "--learner.schedule.gamma-f", "0"], ["learner.schedule.gamma_f", "0.0", "(0, 1]"]),
+    "gamma_f_above_1": (["run", "--learner.schedule.gamma-f", "1.5"], ["gamma_f", "1.5", "(0, 1]"]),
+    "l_f": (["run", "--learner.schedule.l-f", "0"], ["learner.schedule.l_f", "0", "integer in 1.."]),
+    "hz": (["run", "--env.hz", "-1"], ["env.hz", "-1.0", "must be in"]),
+    "period": (["run", "--env.hz", "30", "--env.speed", "1.7"], ["env.speed", "1.7", "multiple", "0.01 s"]),
+    "run_dir_below_a_file": (["run", "--run-dir", "file/run"], ["run_dir", "file/run", "must be a path"]),
+    "run_dir_unwritable": (["run", "--run-dir", "/proc/run"], ["run_dir", "'/proc/run'", "must be a path"]),
+    "run_dir_exists": (["run", "--run-dir", "taken"], ["run_dir", "taken", "must not exist yet"]),
+    "overlap": (
+        ["run", "--learner.schedule.kind", "explicit", "--learner.schedule.t-m", "0", "5"]
+        + ["--learner.schedule.g-m", "6", "2"],
+        ["learner.schedule", "6"],
+    ),
+    "config_missing": (["run", "--config", "none.toml"], ["config", "'none.toml'", "readable"]),
+    "config_is_a_directory": (["run", "--config", "taken"], ["config", "'taken'", "readable"]),
+    "config_no_toml": (["run", "--config", "bad.toml"], ["config", "'bad.toml'", "TOML"]),
+    "config_unknown_key": (["run", "--config", "key.toml"], ["env.herz", "100.0", "hz"]),
+    "config_range": (["run", "--config", "range.toml"], ["gamma_f", "2.0", "(0, 1]"]),
+    "unknown_flag": (["run", "--env.herz", "3"], ["argument", "'--env.herz'", "--help"]),
+    "second_positional": (["run", "gym", "swimmer"], ["argument", "'swimmer'"]),
+    "no_number": (["run", "--env.hz", "fast"], ["env.hz", "'fast'", "a number or None"]),
+    "no_whole_number": (["run", "--env.episode-steps=1.5"], ["env.episode_steps", "'1.5'", "a whole number"]),
+    "no_choice": (["run", "--env.on-miss", "panic"], ["env.on_miss", "'panic'", "hold, neutral"]),
+    "value_missing": (["run", "--seed"], ["seed", "a whole number"]),
+    "endless_sim": (["sim", "pointmass", "--duration-s", "0"], ["duration_s", "0", "above 0"]),
+    "process_without_run": (["agent", "pointmass"], ["run_dir", "must be given"]),
+    "no_run_to_hold": (["hold"], ["run_dir", "runs/"]),
+    "no_run_to_report": (["report", "taken"], ["run", "'taken'", "summary.json"]),
+    "no_recording_to_view": (["view", "taken"], ["run", "'taken'", "recording.rrd"]),
+    "report_of_nothing": (["report"], ["RUN", "must be given"]),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_wrong_input_is_one_line_and_leaves_nothing(name: str, tmp_path: Path) -> None:
+    arguments, words = CASES[name]
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "good.toml").write_text("seed = 3\n")
+    (tmp_path / "bad.toml").write_text(BAD_TOML)
+    (tmp_path / "key.toml").write_text(UNKNOWN_KEY)
+    (tmp_path / "range.toml").write_text(WRONG_RANGE)
+    before = tree(tmp_path)
+
+    done = tenuto(*arguments, cwd=tmp_path)
+
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("tenuto: ")
+    assert done.stderr.count("\n") == 1
+    for word in words:
+        assert word in done.stderr
+    assert tree(tmp_path) == before
+
+
+def test_a_run_that_has_ended_does_not_answer(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "run.toml").write_text("seed = 3\n")
+    done = tenuto("stop", "--run-dir", str(run), cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr == f"tenuto: env_server does not answer in {run}: is the run still going?\n"
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["run", "--help"], ["env", "swimmer", "-h"], ["status", "-h"]])
+def test_help(arguments: list[str], tmp_path: Path) -> None:
+    done = tenuto(*arguments, cwd=tmp_path)
+    assert done.returncode == 0
+    assert "usage: tenuto" in done.stdout
+    assert done.stderr == ""
+    assert tree(tmp_path) == set()
+
+
+def test_help_shows_the_values_of_the_preset(tmp_path: Path) -> None:
+    done = tenuto("run", "swimmer", "--help", cwd=tmp_path)
+    assert "(default: Swimmer-v5)" in done.stdout
+    assert "halfcheetah_authors" in done.stdout
