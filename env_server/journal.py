@@ -16,7 +16,7 @@ BATCH_STEPS = 50
 BATCH_NS = 50_000_000
 
 # A reader that stalls blocks a put for seconds, so steps pile up here meanwhile. 100 000 is 100 s at
-# 1 kHz, and 80 MB of HalfCheetah's steps; beyond it the oldest are dropped and counted.
+# 1 kHz, and 75 MB of HalfCheetah's steps; beyond it the oldest are dropped and counted.
 CAPACITY_STEPS = 100_000
 
 

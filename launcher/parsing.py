@@ -19,7 +19,7 @@ from rtcore.config import ConfigError
 OptionsT = TypeVar("OptionsT")
 
 _WORDS = {"INT": "a whole number", "FLOAT": "a number", "STR": "text", "PATH": "a path"}
-HELP_FLAGS = ("-h", "--help", "-H", "--help-verbose")
+HELP_FLAGS = ("-h", "--help")
 
 
 def parse(
@@ -86,8 +86,7 @@ def _as_config_error(event: _errors.ParseErrorEvent, argv: Sequence[str]) -> Con
         value = value_after(flag, argv) if flag else None
         return ConfigError(_field(event.argument), value, f"must be {_kind(event.argument)}")
     if isinstance(event, _errors.MissingArgs):
-        names = ", ".join(missing.arg.display_name() for missing in event.missing_arguments)
-        return ConfigError("arguments", " ".join(argv), f"{names} must be given")
+        return ConfigError(_field(event.missing_arguments[0].arg), "", "must be given")
     return ConfigError("arguments", " ".join(argv), "not understood; --help shows how")
 
 

@@ -15,6 +15,7 @@ from rich.text import Text
 from tyro.conf import Positional
 
 from launcher import drawing
+from launcher.cli import DONE
 from launcher.drawing import ACCENT, LABEL
 from launcher.parsing import parse
 from launcher.summary import SCHEMA, Summary, discrepancies
@@ -38,8 +39,12 @@ def report(argv: Sequence[str]) -> int:
     options = parse(ReportOptions, argv, prog="tenuto report", description="Show a run's report again.")
     run_dir = RunDir(options.run)
     summary = load(run_dir)
-    Console().print(render(summary, run_dir))
-    return 0
+    try:
+        rendered = render(summary, run_dir)
+    except (KeyError, TypeError) as error:
+        raise ConfigError("run", str(run_dir.path), f"its summary.json lacks {error}") from error
+    Console().print(rendered)
+    return DONE
 
 
 def load(run_dir: RunDir) -> Summary:
@@ -91,7 +96,6 @@ def _real_time(summary: Summary) -> RenderableType:
         ("missed", drawing.misses(deadlines["missed"], deadlines["miss_ratio"])),
         *([("", Text(causes, style=LABEL))] if causes else []),
         ("overruns", f"{deadlines['overruns']:,}"),
-        ("wall time", drawing.clock(summary["wall_s"])),
     ]
     times = drawing.latencies(
         {
@@ -160,7 +164,7 @@ def _accounts(summary: Summary) -> RenderableType:
         rows.append(("restarts", restarts))
     if summary["forced"]:
         rows.append(("killed", Text(", ".join(summary["forced"]) + " did not end in time", style="red")))
-    rows.append(("ended", summary["ended"] or "·"))
+    rows.append(("ended", f"after {drawing.clock(summary['wall_s'])}: {summary['ended']}"))
     return drawing.pairs(rows)
 
 

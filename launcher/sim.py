@@ -10,12 +10,11 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 
-import torch
-
 from agent_service.service import AgentService
 from env_server.service import EnvService
 from env_server.worlds import make_world
 from launcher.summary import StatsByProcess
+from learner.arithmetic import prepare
 from learner.service import LearnerService
 from recorder.service import RecorderService
 from rtcore import channels
@@ -35,7 +34,7 @@ class Simulation:
 
     def __init__(self, config: RunConfig, run_dir: RunDir, stack: ExitStack) -> None:
         """`stack` closes what is opened here, in reverse order."""
-        torch.set_num_threads(config.learner.threads)
+        prepare(config.learner.threads)
         self._clock = VirtualClock(START_NS)
         self._hub = MemoryHub()
         self.ledgers = {name: Ledger(name, START_NS) for name in channels.PROCESSES}

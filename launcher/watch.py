@@ -95,10 +95,14 @@ class Watch:
 
     def ended(self, process: str) -> bool:
         """Whether its newest incarnation said that it ended in order."""
-        recent = self._recent.get(process)
-        return recent is not None and recent[-1].final
+        newest = self._newest(process)
+        return newest is not None and newest.final
 
     def phase(self) -> WindowNotice | None:
         """The phase that the learner entered last."""
-        windows = self._recent[channels.LEARNER][-1].windows if channels.LEARNER in self._recent else []
-        return windows[-1] if windows else None
+        newest = self._newest(channels.LEARNER)
+        return newest.windows[-1] if newest is not None and newest.windows else None
+
+    def _newest(self, process: str) -> Stats | None:
+        lives = [life.newest for (name, _), life in self._lives.items() if name == process]
+        return max(lives, key=lambda stats: stats.incarnation, default=None)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import torch
-
-from learner.memory import keep_freed_memory
+from learner.arithmetic import prepare
 from learner.service import LearnerService
 from rtcore import channels
 from rtcore.process import background, open_process
@@ -13,8 +11,7 @@ from rtcore.process import background, open_process
 def main() -> None:
     """Open, learn, close."""
     with open_process(channels.LEARNER) as process:
-        torch.set_num_threads(process.config.learner.threads)
-        keep_freed_memory()
+        prepare(process.config.learner.threads)
         service = LearnerService(process.config, process.run_dir, process.bus, process.clock, process.ledger)
         process.bus.serve(channels.LEARNER, service.command)
         process.bus.declare_alive(channels.LEARNER)

@@ -5,33 +5,32 @@ from __future__ import annotations
 import numpy as np
 
 from learner.replay import Replay
-from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.ledger import Ledger
+from rtcore.log_reader import LogReader
 from rtcore.messages import Spec, Step
-from rtcore.stream import StepStream, Transitions
+from rtcore.stream import Transitions
 
-CAPACITY = 20_000  # batches; at 20 a second, a quarter of an hour of a learner that does nothing
+CAPACITY_BATCHES = 20_000  # at 20 a second, a quarter of an hour of a learner that does nothing
 
 
 class Intake:
     """Feeds one environment's transitions to the replay.
 
     Counts `received` (steps), `learned` (transitions in the replay), `duplicate`, `gaps` (steps that
-    never came) and `broken` (steps that fit to no transition).
+    never came in time) and `broken` (steps that fit to no transition).
     """
 
     def __init__(self, bus: Bus, env: str, ledger: Ledger) -> None:
-        self._batches = bus.queue(channels.LOG, env, capacity=CAPACITY)
+        self._log = LogReader(bus, env, capacity_batches=CAPACITY_BATCHES)
         self._ledger = ledger
-        self._stream = StepStream()
         self._transitions = Transitions()
         self._replay: Replay | None = None
 
     @property
     def ended(self) -> bool:
         """Whether the env server ended in order and everything it sent is in."""
-        return self._stream.ended
+        return self._log.ended
 
     @property
     def replay_size(self) -> int:
@@ -48,23 +47,22 @@ class Intake:
 
     def wait(self, timeout_s: float) -> None:
         """Wait until something has come, at most so long."""
-        self._batches.wait(timeout_s)
+        self._log.wait(timeout_s)
 
-    def take(self) -> int:
+    def take(self, now_ns: int) -> int:
         """Move all that has come into the replay; returns the number of new transitions."""
-        if self._replay is None:
-            return 0
-        steps: list[Step] = []
-        for received in self._batches.drain():
-            steps += self._stream.feed(received.message)
-        return self._learn(self._replay, steps)
+        return 0 if self._replay is None else self._learn(self._replay, self._log.read(now_ns))
 
-    def finish(self) -> int:
-        """Nothing follows: give up on gaps and take what waited behind them."""
-        return 0 if self._replay is None else self._learn(self._replay, self._stream.flush())
+    def finish(self) -> None:
+        """Nothing follows: give up on gaps, take what waited behind them, and put the replay on disk."""
+        if self._replay is not None:
+            self._learn(self._replay, self._log.finish())
+            self._replay.flush()
 
     def _learn(self, replay: Replay, steps: list[Step]) -> int:
-        learned = 0
+        if not steps:
+            return 0
+        before = self._transitions.transitions
         for step in steps:
             transition = self._transitions.feed(step)
             if transition is not None:
@@ -76,11 +74,13 @@ class Intake:
                     transition.terminated,
                     transition.unit,
                 )
-                learned += 1
-        self._ledger.set_counter("received", self._stream.received)
-        self._ledger.set_counter("learned", self._transitions.transitions)
-        self._ledger.set_counter("duplicate", self._stream.duplicate)
-        self._ledger.set_counter("gaps", self._stream.gaps)
-        self._ledger.set_counter("broken", self._transitions.broken + self._transitions.invalid)
-        self._ledger.set_counter("log.dropped", self._batches.dropped)
-        return learned
+        self._account()
+        return self._transitions.transitions - before
+
+    def _account(self) -> None:
+        stream, transitions = self._log.stream, self._transitions
+        self._ledger.set_counter("received", stream.received)
+        self._ledger.set_counter("learned", transitions.transitions)
+        self._ledger.set_counter("duplicate", stream.duplicate + stream.late)
+        self._ledger.set_counter("gaps", stream.gaps)
+        self._ledger.set_counter("broken", transitions.broken + transitions.invalid)

@@ -21,5 +21,7 @@ def keep_freed_memory() -> bool:
     if mallopt is None:
         return False
     settings = ((_M_MMAP_THRESHOLD, _MMAP_BYTES), (_M_TRIM_THRESHOLD, _TRIM_BYTES))
-    agreed = [mallopt(option, value) == 1 for option, value in settings]  # ask for both, whatever the first says
+    agreed = [
+        mallopt(option, value) == 1 for option, value in settings
+    ]  # ask for both, whatever the first says
     return all(agreed)

@@ -35,7 +35,9 @@ class Publication:
         """Number the next policy after `version`, the last one of an earlier learner of this run."""
         self._version = version
 
-    def publish(self, algorithm: Algorithm, due: PublishDue, spec: Spec, clock: Clock, windows: WindowClock) -> None:
+    def publish(
+        self, algorithm: Algorithm, due: PublishDue, spec: Spec, clock: Clock, windows: WindowClock
+    ) -> None:
         """Publish the policy as it is, unless nothing has changed or its time is over meanwhile."""
         if not self.improved:
             return

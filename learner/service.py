@@ -86,7 +86,7 @@ class LearnerService:
     def step(self) -> bool:
         """Take in, keep the schedule, make at most one gradient step. Says whether it made one."""
         self._take_in()
-        if self._spec is None or self._algorithm is None:
+        if self._spec is None or self._algorithm is None or self._over(self._spec):
             return False
         self._keep_schedule(self._spec)
         if not self._budget.allows():
@@ -127,7 +127,7 @@ class LearnerService:
             self._meet(declared.message)
         if self._spec is None:
             return
-        learned = self._intake.take()
+        learned = self._intake.take(self._clock.now_ns())
         if learned:
             phase = self._conductor.position.phase if self._conductor.position else "update"
             self._budget.earn(learned, phase)
@@ -146,7 +146,7 @@ class LearnerService:
         if resume.restore(self._run_dir, self._algorithm):
             version = resume.last_published(self._run_dir)
             self._publication.go_on_from(version)
-            text = f"goes on from the run's checkpoint: policy {version}, {len(replay)} transitions in the replay"
+            text = f"goes on from the checkpoint: policy {version}, {len(replay)} transitions in the replay"
             self._ledger.event(self._clock.now_ns(), "INFO", text)
 
     def _keep_schedule(self, spec: Spec) -> None:
@@ -199,6 +199,12 @@ class LearnerService:
         self.outbox.put(notice)
 
     # ---- small things
+
+    def _over(self, spec: Spec) -> bool:
+        """Whether the run has ended: windows and learning end with the world."""
+        duration_ns = round(self._config.duration_s * 1e9)
+        over = 0 < duration_ns <= self._clock.now_ns() - spec.t0_ns
+        return over or self._intake.ended
 
     def _at_half_power(self) -> bool:
         return self._config.learner.hold_learning == "half" and not self._conductor.improving

@@ -84,9 +84,7 @@ def _right(plots: _Plots, spec: Spec) -> list[Any]:
     return [
         plots.lines(latency, "/agent/loop_us", "/agent/reaction_us", "/env/pacing_us", legend=True),
         plots.lines("Missed deadlines", "/agent/missed"),
-        plots.lines(
-            "Policy version", "/learner/published_version", "/agent/policy_version", legend=True
-        ),
+        plots.lines("Policy version", "/learner/published_version", "/agent/policy_version", legend=True),
         rrb.Tabs(
             plots.lines("Losses", "/learner/loss/**", legend=True),
             plots.lines("Forecast", FORECAST, legend=True),
@@ -106,11 +104,11 @@ class _Plots:
     """
 
     def __init__(self, live: bool) -> None:
-        window = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+        bound = rr.TimeRangeBoundary
+        start, end = bound.absolute(seconds=0.0), bound.infinite()  # what was said before T0 is in the log
         if live:
-            start = rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S)
-            window = rr.TimeRange(start=start, end=rr.TimeRangeBoundary.cursor_relative())
-        self._axis = rrb.TimeAxis(link="Independent", view_range=window)
+            start, end = bound.cursor_relative(seconds=-LIVE_WINDOW_S), bound.cursor_relative()
+        self._axis = rrb.TimeAxis(link="Independent", view_range=rr.TimeRange(start=start, end=end))
 
     def lines(self, name: str, *entities: str, legend: bool = False) -> rrb.TimeSeriesView:
         """Scalars of some entities; a legend where the title does not say which series it is."""

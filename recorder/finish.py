@@ -1,7 +1,11 @@
-"""The end of a recording, orderly or not: compacted, given a footer, checked. Needs no rerun import."""
+"""The end of a recording, orderly or not: compacted, given a footer, checked. Needs no rerun import.
+
+After a crash of everything: `python -m recorder.finish RECORDING`.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import signal
@@ -56,11 +60,14 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
         part.unlink()
 
 
-def run_cli(arguments: Sequence[str], *, timeout_s: float) -> None:
+def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
     """Run rerun's command line, with nothing inherited and its usage statistics switched off.
 
     It reads that switch from the user's configuration directory alone, so it gets a home directory of
     its own for the moment, and the user's is not touched. A Ctrl-C in the terminal does not reach it.
+
+    Returns:
+        What it printed.
 
     Raises:
         FinishError: it failed, or took longer than `timeout_s`.
@@ -83,14 +90,38 @@ def run_cli(arguments: Sequence[str], *, timeout_s: float) -> None:
                 if isinstance(error, subprocess.TimeoutExpired):
                     raise FinishError(f"rerun {' '.join(arguments[:2])} took over {timeout_s:g} s") from error
                 raise
+    text = output.decode(errors="replace").strip()
     if child.returncode != 0:
-        lines = output.decode(errors="replace").strip().splitlines() or ["no output"]
-        raise FinishError(f"rerun {' '.join(arguments[:2])} failed ({child.returncode}): {lines[-1]}")
+        last = text.splitlines()[-1] if text else "no output"
+        raise FinishError(f"rerun {' '.join(arguments[:2])} failed ({child.returncode}): {last}")
+    return text
 
 
 def switch_off_statistics(home: Path) -> None:
-    """Write the configuration that `rerun analytics disable` would write, below `home`."""
-    folder = home / ".config" / "rerun"
-    folder.mkdir(parents=True)
-    settings = {"analytics_enabled": False, "analytics_id": "", "metadata": {}}
-    (folder / "analytics.json").write_text(json.dumps(settings))
+    """Write below `home` what `rerun analytics disable` would (0.41; it ignores a file that lacks a field)."""
+    path = home / ".config" / "rerun" / "analytics.json"
+    path.parent.mkdir(parents=True)
+    settings = {
+        "analytics_enabled": False,
+        "analytics_id": "",
+        "metadata": {},
+        "config_file_path": str(path),
+        "data_dir_path": str(home / "analytics"),
+    }
+    path.write_text(json.dumps(settings))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Finish a recording; 1 if that fails."""
+    parser = argparse.ArgumentParser(prog="python -m recorder.finish", description="Repair a recording.")
+    parser.add_argument("recording", type=Path)
+    try:
+        finish(parser.parse_args(argv).recording)
+    except FinishError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

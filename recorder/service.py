@@ -29,6 +29,11 @@ CHUNK_ROWS = 50  # the knee of cost per row
 MIN_AGE_NS = 500_000_000  # a chunk of so many rows waits at least so long ...
 MAX_AGE_NS = 1_000_000_000  # ... and a smaller one at most so long
 MAX_ROWS = 2_000
+# The file is complete without being compacted, so compaction may take only what an end has to spare:
+# whoever interrupts waits 5 s for all of it, at most 2 of them for the others' last words.
+COMPACT_S = 10.0
+COMPACT_INTERRUPTED_S = 1.5
+LAST_S_NS = 1_000_000_000  # a step in the last second of the duration: nobody interrupted
 
 
 class RecorderService:
@@ -49,6 +54,8 @@ class RecorderService:
         self._writer: RunWriter | None = None
         self._steps: list[Step] = []
         self._oldest_ns: int | None = None  # when the oldest row that waits came in
+        self._newest_ns = 0  # deadline of the newest step
+        self._due_end_ns: int | None = None  # when the run is to end
         self._stall_told = False
         self._gaps_told = 0
         self._closed = False
@@ -68,8 +75,12 @@ class RecorderService:
         spec = self._intake.take_spec()
         if spec is not None and self._writer is None:
             self._writer = self._begin(recording, spec)
+            if self._config.duration_s:
+                self._due_end_ns = spec.t0_ns + round(self._config.duration_s * 1e9)
         now_ns = self._clock.now_ns()
         self._steps += self._intake.take_steps(now_ns)
+        if self._steps:
+            self._newest_ns = self._steps[-1].due_ns
         news = self._intake.take_telemetry()
         if self._oldest_ns is None and (self._steps or news):
             self._oldest_ns = now_ns
@@ -105,10 +116,11 @@ class RecorderService:
             self._say("WARN", "no env server ever declared itself: the recording is empty")
         self._account(recording)
         recording.close()
+        done = self._due_end_ns is not None and self._newest_ns >= self._due_end_ns - LAST_S_NS
         try:
-            finish(self._run_dir.recording_path)
+            finish(self._run_dir.recording_path, timeout_s=COMPACT_S if done else COMPACT_INTERRUPTED_S)
         except FinishError as error:
-            self._say("WARN", f"the recording stays as it was written, which viewers can read: {error}")
+            self._say("WARN", f"the recording is complete but stays as it was written: {error}")
 
     def command(self, command: Command) -> CommandReply:
         """Answer an operator; called on the bus's thread."""

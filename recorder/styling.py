@@ -13,9 +13,10 @@ from recorder.telemetry import FORECAST
 
 BLUE, ORANGE, GREEN = 0x4E9BFFFF, 0xFFA23AFF, 0x3ECF8EFF
 RED, PURPLE, GREY = 0xFF5A5FFF, 0xB18CFFFF, 0x9AA4B2FF
+DOT_SIZE = 3.0
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
 
-Drawing = Literal["Average", "Max", "Steps", "Dots"]
+Drawing = Literal["Average", "Max", "Steps", "Dots", "Line and dots"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +24,8 @@ class Look:
     """Names and colours of an entity's series, and what zooming out may do to them.
 
     `Average` is for quantities whose mean matters. `Max` is for latencies and misses: the default
-    would draw a single spike at half its height (measured). `Steps` holds a value until the next one.
+    would draw a single spike at half its height (measured). `Steps` holds a value until the next one,
+    `Dots` are for events.
     """
 
     names: tuple[str, ...]
@@ -34,13 +36,13 @@ class Look:
 
 LOOKS: dict[str, Look] = {
     "/env/reward": Look(("reward",), (BLUE,), width=1.0),
-    "/env/return": Look(("return",), (GREEN,), "Dots"),
+    "/env/return": Look(("return",), (GREEN,), "Line and dots"),
     "/env/pacing_us": Look(("pacing error",), (GREY,), "Max"),
     "/agent/loop_us": Look(("loop",), (ORANGE,), "Max"),
     "/agent/reaction_us": Look(("agent's reaction",), (BLUE,), "Max"),
     "/agent/missed": Look(("missed",), (RED,), "Max"),
     "/agent/policy_version": Look(("acting",), (ORANGE,), "Steps"),
-    "/learner/published_version": Look(("published",), (BLUE,), "Steps"),
+    "/learner/published_version": Look(("published",), (BLUE,), "Dots"),
     "/learner/loss/critic": Look(("critic",), (BLUE,)),
     "/learner/loss/actor": Look(("actor",), (ORANGE,)),
     "/learner/loss/alpha": Look(("temperature",), (PURPLE,)),
@@ -55,19 +57,18 @@ TARGET_AND_SPEED = Look(("target", "reached"), (ORANGE, BLUE), width=1.5)
 
 def looks(look: Look) -> list[rr.AsComponents]:
     """The static archetypes of a look."""
+    names, colours = list(look.names), np.array(look.colours, np.uint32)
+    dots = rr.SeriesPoints(names=names, colors=colours, markers="Circle", marker_sizes=[DOT_SIZE])
+    if look.drawing == "Dots":
+        return [dots]
     lines = rr.SeriesLines(
-        names=list(look.names),
-        colors=np.array(look.colours, np.uint32),
-        widths=[look.width] * len(look.names),
+        names=names,
+        colors=colours,
+        widths=[look.width] * len(names),
         aggregation_policy="Max" if look.drawing == "Max" else "Average",
         interpolation_mode="StepAfter" if look.drawing == "Steps" else "Linear",
     )
-    if look.drawing != "Dots":
-        return [lines]
-    dots = rr.SeriesPoints(
-        names=list(look.names), colors=np.array(look.colours, np.uint32), markers="Circle", marker_sizes=[3.0]
-    )
-    return [lines, dots]
+    return [lines, dots] if look.drawing == "Line and dots" else [lines]
 
 
 def forecast_look(names: Sequence[str]) -> Look:

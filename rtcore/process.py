@@ -71,9 +71,15 @@ class Reporter:
 def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The arguments that every process takes."""
     parser = argparse.ArgumentParser(prog=f"python -m {role}", description=f"Tenuto's {role}.")
-    parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="run directory with a run.toml")
-    parser.add_argument("--connect", action="append", default=[], metavar="EP", help="further endpoint to reach")
-    parser.add_argument("--listen", action="append", default=[], metavar="EP", help="further endpoint to offer")
+    parser.add_argument(
+        "--run", type=Path, required=True, metavar="DIR", help="run directory with a run.toml"
+    )
+    parser.add_argument(
+        "--connect", action="append", default=[], metavar="EP", help="further endpoint to reach"
+    )
+    parser.add_argument(
+        "--listen", action="append", default=[], metavar="EP", help="further endpoint to offer"
+    )
     parser.add_argument("--supervised", action="store_true", help="end when the parent process ends")
     return parser.parse_args(argv)
 

@@ -53,7 +53,9 @@ def test_it_equals_the_plain_formula_for_two_layers() -> None:
         std = np.exp(np.clip(w["log_std.weight"] @ h + w["log_std.bias"], -20, 2))
         noise = np.random.default_rng(seed).standard_normal(2, dtype=np.float32)
         wanted = (HIGH + LOW) / 2 + (HIGH - LOW) / 2 * np.tanh(mean + std * noise)
-        np.testing.assert_allclose(policy.act(observation, np.random.default_rng(seed)), wanted, rtol=2e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            policy.act(observation, np.random.default_rng(seed)), wanted, rtol=2e-5, atol=1e-6
+        )
 
 
 def test_pi_0_fills_the_action_space_evenly_and_repeats_with_its_seed() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
@@ -26,10 +24,10 @@ SPEC = Spec(
 
 def step(tick: int, *, incarnation: int = 7, dim: int = 3) -> Step:
     return Step(
-        env="env0", incarnation=incarnation, seq=tick, tick=tick, episode=0, episode_tick=tick, unit=0, due_ns=0,
-        woke_ns=0, sent_ns=0, observation=np.zeros(dim, np.float32).tobytes(), reward=0.0, terminated=False,
-        truncated=False, action=b"", decision=b"", answered_tick=-1, policy_version=-1, missed=False, fallback="",
-        cause="", skipped=0, loop_ns=-1, reaction_ns=-1, drift=0.0, position=b"",
+        env="env0", incarnation=incarnation, seq=tick, tick=tick, episode=0, episode_tick=tick, unit=0,
+        due_ns=0, woke_ns=0, sent_ns=0, observation=np.zeros(dim, np.float32).tobytes(), reward=0.0,
+        terminated=False, truncated=False, action=b"", decision=b"", answered_tick=-1, policy_version=-1,
+        missed=False, fallback="", cause="", skipped=0, loop_ns=-1, reaction_ns=-1, drift=0.0, position=b"",
     )  # fmt: skip
 
 
@@ -71,8 +69,8 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    yield Rig(MemoryHub())
+def rig() -> Rig:
+    return Rig(MemoryHub())
 
 
 def values(action: Action | None) -> np.ndarray:
@@ -134,7 +132,9 @@ def test_a_policy_that_never_acted_is_superseded_and_a_repeat_counts_apart(rig: 
 
 def spoiled_hash(version: int) -> Policy:
     good = policy(version)
-    return Policy(**{name: getattr(good, name) for name in good.__struct_fields__ if name != "sha256"}, sha256="0" * 64)
+    return Policy(
+        **{name: getattr(good, name) for name in good.__struct_fields__ if name != "sha256"}, sha256="0" * 64
+    )
 
 
 def spoiled_weights(version: int) -> Policy:
@@ -180,6 +180,8 @@ def test_a_restarted_environment_is_answered_once_it_declares_itself(rig: Rig) -
     rig.specs.put(SPEC)
     rig.answer(step(0))
     assert rig.answer(step(0, incarnation=8)) is None
-    rig.specs.put(Spec(**{n: getattr(SPEC, n) for n in SPEC.__struct_fields__ if n != "incarnation"}, incarnation=8))
+    rig.specs.put(
+        Spec(**{n: getattr(SPEC, n) for n in SPEC.__struct_fields__ if n != "incarnation"}, incarnation=8)
+    )
     answer = rig.answer(step(1, incarnation=8))
     assert answer is not None and answer.incarnation == 8

@@ -33,7 +33,9 @@ def test_one_follows_from_the_other(
     assert resolve_period(env, CHEETAH) == env
 
 
-@pytest.mark.parametrize(("hz", "speed"), [(200.0, 3.0), (200.0, 1.0), (60.0, 1.0), (1000.0, 1.0)])
+@pytest.mark.parametrize(
+    ("hz", "speed"), [(200.0, 3.0), (200.0, 1.0), (60.0, 1.0), (1000.0, 1.0), (1e6, 1e-3)]
+)
 def test_a_period_of_broken_physics_steps_is_refused(hz: float, speed: float) -> None:
     with pytest.raises(
         ConfigError, match=r"^env.speed = .* is no whole multiple of the physics step of 0.01 s"

@@ -212,6 +212,14 @@ def test_an_overrun_loses_deadlines_and_the_drift_stays_on_the_wall_clock() -> N
     assert (pacing.count, pacing.quantile(1.0)) == (39, 6_000_000)
 
 
+def test_the_unit_is_that_of_the_deadline_however_late_the_tick() -> None:
+    world = ScriptedWorld()
+    rig = Rig(run_config(duration_s=0.2, episode_steps=1000, unit_s=0.105), world)
+    world.on_step = lambda number: rig.clock.advance_ns(16_000_000 if number == 9 else 0)
+    late = rig.run()[10]  # due 100 ms after T0, begun at 106 ms, in unit 1 by then
+    assert (late.tick, late.woke_ns - late.due_ns, late.unit, late.drift) == (10, 6_000_000, 0, 0.0)
+
+
 def test_misses_after_a_late_step_are_the_env_servers_own() -> None:
     world = ScriptedWorld()
     rig = Rig(run_config(duration_s=0.2, episode_steps=1000), world)

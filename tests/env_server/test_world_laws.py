@@ -58,14 +58,19 @@ def _trace(world: World, seed: int | None) -> list[tuple[bytes, float, bytes]]:
     return trace
 
 
+def _is_vector(array: Vector, size: int) -> None:
+    assert array.shape == (size,)
+    assert array.dtype == np.float32
+
+
 def test_spaces(world: World) -> None:
     assert world.action_low.shape == world.action_high.shape == (world.action_dim,)
     assert world.action_low.dtype == world.action_high.dtype == np.float32
     assert np.isfinite(world.action_low).all() and (world.action_low < world.action_high).all()
     observation = world.reset(0, 0)
-    assert (observation.shape, observation.dtype) == ((world.observation_dim,), np.float32)
+    _is_vector(observation, world.observation_dim)
     outcome = world.step(_actions(world)[0], 0)
-    assert (outcome.observation.shape, outcome.observation.dtype) == ((world.observation_dim,), np.float32)
+    _is_vector(outcome.observation, world.observation_dim)
     assert type(outcome.reward) is float and np.isfinite(outcome.reward)
     assert world.position().dtype == np.float64
     assert (world.position().size > 0) == (world.scene != "")

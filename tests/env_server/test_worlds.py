@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from gymnasium.spaces import Box
 
 from env_server.gym_world import GymWorld
+from env_server.period import Timing
 from env_server.worlds import SPEED_WORLDS, make_world, resolve
 from rtcore.config import ConfigError, DriftConfig, EnvConfig
 
@@ -19,12 +21,9 @@ NONE = DriftConfig(kind="none")
 
 
 @pytest.mark.parametrize(("env_id", "timing"), SPEED_WORLDS.items())
-def test_the_table_of_speed_worlds_agrees_with_the_simulator(env_id: str, timing: object) -> None:
+def test_the_table_of_speed_worlds_agrees_with_the_simulator(env_id: str, timing: Timing) -> None:
     world = GymWorld(env_id, seed=0)
-    assert (world.native_period_s, world.physics_step_s) == (
-        SPEED_WORLDS[env_id].native_s,
-        SPEED_WORLDS[env_id].physics_s,
-    )
+    assert Timing(world.native_period_s, world.physics_step_s) == timing
     world.close()
 
 
@@ -41,7 +40,7 @@ def test_the_table_of_speed_worlds_agrees_with_the_simulator(env_id: str, timing
 )
 def test_resolve_fills_in(env: EnvConfig, hz: float, speed: float | None) -> None:
     resolved = resolve(env)
-    assert (resolved.hz, resolved.speed) == (pytest.approx(hz), speed)
+    assert (resolved.hz, resolved.speed) == (hz, speed)
     assert resolve(resolved) == resolved
 
 
@@ -80,12 +79,12 @@ def test_wrong_requests_are_one_line(env: EnvConfig, message: str) -> None:
         assert "\n" not in str(caught.value)
 
 
-class _Odd(gymnasium.Env[object, object]):
+class _Odd(gymnasium.Env[Any, Any]):
     """An environment with whatever spaces a test gives it."""
 
-    def __init__(self, observations: Box, actions: Box) -> None:
-        self.observation_space = observations
-        self.action_space = actions
+    def __init__(self, **spaces: Box) -> None:
+        self.observation_space = spaces["observations"]
+        self.action_space = spaces["actions"]
 
 
 @pytest.mark.parametrize(
@@ -94,18 +93,49 @@ class _Odd(gymnasium.Env[object, object]):
         (
             Box(0, 255, (96, 96, 3), np.uint8),
             Box(-1, 1, (1,)),
-            "an observation of 27648 numbers is too large",
+            "an observation of 27648 numbers is too large: a step carries 7244",
         ),
         (Box(-1, 1, (2,)), Box(-np.inf, np.inf, (1,)), "needs a bounded action space"),
     ],
 )
 def test_spaces_that_do_not_fit(observations: Box, actions: Box, message: str) -> None:
-    gymnasium.register("TenutoOdd-v0", entry_point=lambda: _Odd(observations, actions))
+    spaces = {"observations": observations, "actions": actions}
+    gymnasium.register("TenutoOdd-v0", entry_point=_Odd, kwargs=spaces)
     try:
         with pytest.raises(ConfigError, match=message):
             resolve(EnvConfig(id="TenutoOdd-v0", hz=10.0))
     finally:
         gymnasium.registry.pop("TenutoOdd-v0")
+
+
+class _Hoarder(gymnasium.Env[Any, Any]):
+    """An environment that hands out its own memory, and flattens to 4 numbers and 2 actions."""
+
+    observation_space = Box(-9, 9, (2, 2))
+    action_space = Box(-1, 1, (2, 1), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        self.state = np.zeros((2, 2), np.float32)
+        return self.state, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert action.shape == (2, 1) and action.dtype == np.float64
+        self.state += action
+        return self.state, 1, True, True, {}
+
+
+def test_shapes_are_flattened_and_memory_is_copied() -> None:
+    gymnasium.register("TenutoHoarder-v0", entry_point=_Hoarder)
+    try:
+        world = make_world(EnvConfig(id="TenutoHoarder-v0", hz=10.0), 0)
+    finally:
+        gymnasium.registry.pop("TenutoHoarder-v0")
+    first = world.reset(0, 0)
+    outcome = world.step(np.array([1.0, -0.5], np.float32), 0)
+    assert first.tolist() == [0, 0, 0, 0]
+    assert outcome.observation.tolist() == [1, 1, -0.5, -0.5]
+    assert (outcome.reward, outcome.terminated, outcome.truncated) == (1.0, True, False)
+    assert world.action_low.tolist() == [-1, -1]
 
 
 @pytest.mark.parametrize(

@@ -6,16 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from launcher.cli import COMMANDS, Command, run_command
 from tests.launcher.commands import tenuto, tree
 
 BAD_TOML = "[env]\nhz = = 3\n"
 UNKNOWN_KEY = "[env]\nherz = 100.0\n"
+OVERLAP = '[learner.schedule]\nkind = "explicit"\nt_m = [0, 5]\ng_m = [6, 2]\n'
 WRONG_RANGE = "[learner.schedule]\ngamma_f = 2.0\n"
 
-CASES = {
-    "command": (["rum"], ["command", "'rum'", "run, sim"]),
+# The ones that people make most are tried on the real command.
+TYPED = {
     "preset": (["run", "cheetah"], ["preset", "'cheetah'", "halfcheetah, "]),
-    "preset_and_config": (["run", "gym", "--config", "good.toml"], ["config", "good.toml", "'gym'"]),
     "env_id": (["run", "gym", "--env.id", "Nowhere-v5"], ["env.id", "'Nowhere-v5'"]),
     "discrete_actions": (["run", "gym", "--env.id", "CartPole-v1"], ["env.id", "'CartPole-v1'"]),
     "gamma_f_0": (["run", "--learner.schedule.gamma-f", "0"], ["learner.schedule.gamma_f", "0.0", "(0, 1]"]),
@@ -27,11 +28,14 @@ CASES = {
     "run_dir_unwritable": (["run", "--run-dir", "/proc/run"], ["run_dir", "'/proc/run'", "must be a path"]),
     "run_dir_exists": (["run", "--run-dir", "taken"], ["run_dir", "taken", "must not exist yet"]),
     "overlap": (
-        ["run", "--learner.schedule.kind", "explicit", "--learner.schedule.t-m", "0", "5"]
-        + ["--learner.schedule.g-m", "6", "2"],
+        ["run", "--config", "overlap.toml"],
         ["learner.schedule", "6"],
     ),
     "config_missing": (["run", "--config", "none.toml"], ["config", "'none.toml'", "readable"]),
+}
+OTHERS = {
+    "command": (["rum"], ["command", "'rum'", "run, sim"]),
+    "preset_and_config": (["run", "gym", "--config", "good.toml"], ["config", "good.toml", "'gym'"]),
     "config_is_a_directory": (["run", "--config", "taken"], ["config", "'taken'", "readable"]),
     "config_no_toml": (["run", "--config", "bad.toml"], ["config", "'bad.toml'", "TOML"]),
     "config_unknown_key": (["run", "--config", "key.toml"], ["env.herz", "100.0", "hz"]),
@@ -41,36 +45,61 @@ CASES = {
     "no_number": (["run", "--env.hz", "fast"], ["env.hz", "'fast'", "a number or None"]),
     "no_whole_number": (["run", "--env.episode-steps=1.5"], ["env.episode_steps", "'1.5'", "a whole number"]),
     "no_choice": (["run", "--env.on-miss", "panic"], ["env.on_miss", "'panic'", "hold, neutral"]),
+    "no_entry": (["run", "--learner.hidden", "64", "x"], ["learner.hidden", "a whole number"]),
     "value_missing": (["run", "--seed"], ["seed", "a whole number"]),
     "endless_sim": (["sim", "pointmass", "--duration-s", "0"], ["duration_s", "0", "above 0"]),
     "process_without_run": (["agent", "pointmass"], ["run_dir", "must be given"]),
     "no_run_to_hold": (["hold"], ["run_dir", "runs/"]),
     "no_run_to_report": (["report", "taken"], ["run", "'taken'", "summary.json"]),
     "no_recording_to_view": (["view", "taken"], ["run", "'taken'", "recording.rrd"]),
-    "report_of_nothing": (["report"], ["RUN", "must be given"]),
+    "report_of_nothing": (["report"], ["run", "must be given"]),
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_wrong_input_is_one_line_and_leaves_nothing(name: str, tmp_path: Path) -> None:
-    arguments, words = CASES[name]
+@pytest.fixture
+def somewhere(tmp_path: Path) -> Path:
+    """A directory with what the mistakes refer to."""
     (tmp_path / "taken").mkdir()
     (tmp_path / "file").write_text("")
     (tmp_path / "good.toml").write_text("seed = 3\n")
+    (tmp_path / "overlap.toml").write_text(OVERLAP)
     (tmp_path / "bad.toml").write_text(BAD_TOML)
     (tmp_path / "key.toml").write_text(UNKNOWN_KEY)
     (tmp_path / "range.toml").write_text(WRONG_RANGE)
-    before = tree(tmp_path)
+    return tmp_path
 
-    done = tenuto(*arguments, cwd=tmp_path)
 
+@pytest.mark.parametrize("name", TYPED)
+def test_wrong_input_is_one_line_and_leaves_nothing(name: str, somewhere: Path) -> None:
+    arguments, words = TYPED[name]
+    before = tree(somewhere)
+    done = tenuto(*arguments, cwd=somewhere)
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
-    assert done.stderr.startswith("tenuto: ")
-    assert done.stderr.count("\n") == 1
+    check_line(done.stderr, words)
+    assert tree(somewhere) == before
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_so_are_rarer_mistakes(
+    name: str, somewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments, words = OTHERS[name]
+    before = tree(somewhere)
+    monkeypatch.chdir(somewhere)
+    assert run_command(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    check_line(said.err, words)
+    assert tree(somewhere) == before
+
+
+def check_line(stderr: str, words: list[str]) -> None:
+    assert stderr.startswith("tenuto: ")
+    assert stderr.count("\n") == 1
+    assert stderr.endswith("\n")
     for word in words:
-        assert word in done.stderr
-    assert tree(tmp_path) == before
+        assert word in stderr
 
 
 def test_a_run_that_has_ended_does_not_answer(tmp_path: Path) -> None:
@@ -82,16 +111,37 @@ def test_a_run_that_has_ended_does_not_answer(tmp_path: Path) -> None:
     assert done.stderr == f"tenuto: env_server does not answer in {run}: is the run still going?\n"
 
 
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["run", "--help"], ["env", "swimmer", "-h"], ["status", "-h"]])
-def test_help(arguments: list[str], tmp_path: Path) -> None:
-    done = tenuto(*arguments, cwd=tmp_path)
-    assert done.returncode == 0
-    assert "usage: tenuto" in done.stdout
-    assert done.stderr == ""
+@pytest.mark.parametrize(
+    "arguments",
+    [["run", "--help"], ["env", "swimmer", "-h"], ["sim", "-h"], ["status", "-h"], ["view", "-h"]],
+)
+def test_help(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        run_command(arguments)
+    assert exit_.value.code in (0, None)
+    assert f"usage: tenuto {arguments[0]}" in capsys.readouterr().out
     assert tree(tmp_path) == set()
 
 
-def test_help_shows_the_values_of_the_preset(tmp_path: Path) -> None:
-    done = tenuto("run", "swimmer", "--help", cwd=tmp_path)
-    assert "(default: Swimmer-v5)" in done.stdout
-    assert "halfcheetah_authors" in done.stdout
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_the_list_of_commands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(arguments) == 0
+    listed = capsys.readouterr().out
+    for command in COMMANDS:
+        assert f"  {command.name} " in listed
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_every_command_of_the_table_exists(command: Command) -> None:
+    assert callable(command.load())
+
+
+def test_help_shows_the_values_of_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run_command(["run", "swimmer", "--help"])
+    shown = capsys.readouterr().out
+    assert "(default: Swimmer-v5)" in shown
+    assert "halfcheetah_authors" in shown

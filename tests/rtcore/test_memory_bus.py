@@ -16,7 +16,7 @@ from rtcore.clock import VirtualClock
 from rtcore.codec import Codec, Rejections
 from rtcore.inbox import QueueInbox, ThreadBell
 from rtcore.memory_bus import MemoryHub
-from rtcore.messages import Command, CommandReply
+from rtcore.messages import Command, CommandReply, Message
 from tests.rtcore.bus_samples import ENV, SAMPLES, batch, stats, step
 
 MS = 1_000_000
@@ -84,7 +84,7 @@ def test_many_threads_lose_nothing_uncounted() -> None:
 
 
 @pytest.mark.parametrize("channel", channels.TABLE, ids=lambda channel: channel.name)
-def test_no_bytes_whatever_raise_in_decode(channel: channels.Channel[channels.messages.Message]) -> None:
+def test_no_bytes_whatever_raise_in_decode(channel: channels.Channel[Message]) -> None:
     valid = msgspec.msgpack.encode(SAMPLES[channel.name][1])
     codec = Codec(channel, Rejections(lambda: 0))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import pytest
 import safetensors.numpy
@@ -19,11 +20,11 @@ from rtcore.lifecycle import Stop
 from rtcore.run_dir import RunDir
 
 
-def small(seed: int = 7, **learner: object) -> RunConfig:
+def small(seed: int = 7, **learner: Any) -> RunConfig:
     """Half a minute of point mass: 5 windows of 3 + 2 units (1 s, 40 ticks)."""
     base = pointmass()
     env = resolve(replace(base.env, hz=40.0, speed=None, episode_steps=50, unit_s=1.0))
-    settings: dict[str, object] = {
+    settings: dict[str, Any] = {
         "hidden": (16, 16), "batch": 32, "learning_starts": 100, "utd": 1.0,
         "schedule": ScheduleConfig(l_f=5, gamma_f=0.6),
     }  # fmt: skip
@@ -51,7 +52,9 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Summary, bytes]:
     return run(tmp_path_factory.mktemp("sim") / "run", small())
 
 
-def test_the_same_seed_gives_equal_bytes_and_equal_summaries(once: tuple[Summary, bytes], tmp_path: Path) -> None:
+def test_the_same_seed_gives_equal_bytes_and_equal_summaries(
+    once: tuple[Summary, bytes], tmp_path: Path
+) -> None:
     summary, weights = run(tmp_path / "again", small())
     assert weights == once[1]
     assert summary == once[0]

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from launcher.summary import discrepancies, summarise
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER
+from tests.launcher.ledgers import CONFIG, agent_ledger, env_ledger, episode, ledger, whole_run
+
+
+def summary_of(stats: dict[str, Any]) -> dict[str, Any]:
+    return summarise(CONFIG, "r1", stats, wall_s=4.5, restarts={}, ended="duration")
+
+
+def test_the_whole_summary_of_a_small_run() -> None:
+    nothing = {"p50": None, "p99": None, "p999": None, "max": None}
+    summary = summary_of(whole_run())
+    pacing = summary.pop("pacing_error_us")
+    assert pacing["p50"] == pytest.approx(1.0, rel=0.01)
+    assert pacing["max"] == 9.0
+    assert summary == {
+        "schema": 1,
+        "run": "r1",
+        "preset": "pointmass",
+        "env": "pointmass",
+        "algo": "sac",
+        "seed": 4,
+        "tick_hz": 100.0,
+        "unit_s": 1.0,
+        "wall_s": 4.5,
+        "ended": "duration",
+        "forced": [],
+        "ticks": 200,
+        "resets": 2,
+        "episodes": 2,
+        "mean_return": -20.0,
+        "returns": [-30.0, -10.0],
+        "deadlines": {
+            "missed": 3,
+            "miss_ratio": 0.015,
+            "overruns": 1,
+            "skipped": 50,
+            "missed_by_cause": {"agent_late": 2, "agent_absent": 0, "env_late": 1},
+        },
+        "reaction_us": dict.fromkeys(nothing, 80.0),
+        "loop_us": dict.fromkeys(nothing, 500.0),
+        "policies": {
+            "published": 4,
+            "adopted": 1,
+            "rejected": 1,
+            "superseded": 1,
+            "unused": 0,
+            "unreceived": 1,
+            "published_in_hold": 0,
+            "withheld": 0,
+            "last_version": 4,
+            "publish_to_adopt_ms": {"p50": 4.0, "p99": 4.0, "max": 4.0},
+        },
+        "windows": [{"m": 0, "t_m": 0, "G": 7, "N": 3}, {"m": 1, "t_m": 10, "G": 7, "N": 3}],
+        "operator_holds": 1,
+        "transitions": {"produced": 198, "learned": 197, "lost": 1, "duplicate": 5},
+        "learner": {"gradient_steps": 250, "policy_steps": 100, "updates_per_s": 100.0},  # in 2.5 s
+        "forecast": {"windows": None, "error": None, "baseline_error": None},
+        "recorder": {"rows": 900, "dropped": 7},
+        "restarts": {"env_server": 0, "agent_service": 0, "learner": 0, "recorder": 0},
+        "messages": {"rejected": 3},
+    }
+    assert discrepancies(summary) == []
+
+
+def test_incarnations_are_added_up() -> None:
+    stats = whole_run()
+    later = ledger(
+        ENV_SERVER,
+        incarnation=9,
+        counters={"ticks": 100, "resets": 1, "produced": 99, "missed": 1, "missed.agent_absent": 1},
+        histograms={"loop": [700_000, 700_000, 700_000]},
+        returns=[episode(0, 10.0)],
+    )
+    stats[ENV_SERVER] = [later, *stats[ENV_SERVER]]
+    summary = summary_of(stats)
+    assert summary["ticks"] == 300
+    assert summary["returns"] == [-30.0, -10.0, 10.0]
+    assert summary["mean_return"] == -10.0
+    assert summary["deadlines"]["missed_by_cause"] == {"agent_late": 2, "agent_absent": 1, "env_late": 1}
+    assert summary["loop_us"]["p50"] == pytest.approx(700.0, rel=0.01)
+    assert summary["transitions"]["produced"] == 297
+    assert summary["transitions"]["lost"] == 100
+
+
+def test_a_run_in_which_nothing_happened() -> None:
+    summary = summary_of({})
+    assert summary["mean_return"] is None
+    assert summary["deadlines"]["miss_ratio"] is None
+    assert summary["learner"]["updates_per_s"] is None
+    assert summary["loop_us"] == {"p50": None, "p99": None, "p999": None, "max": None}
+    assert summary["windows"] == []
+    assert discrepancies(summary) == []
+    assert json.loads(json.dumps(summary)) == summary
+
+
+def test_a_judged_forecast() -> None:
+    stats = whole_run()
+    gauges = {"forecast/windows": 6.0, "forecast/error": 0.5, "forecast/baseline_error": 0.75}
+    stats[LEARNER].append(ledger(LEARNER, incarnation=2, gauges=gauges))
+    assert summary_of(stats)["forecast"] == {"windows": 6, "error": 0.5, "baseline_error": 0.75}
+
+
+def test_counts_that_do_not_reconcile_are_named() -> None:
+    stats = whole_run()
+    env = env_ledger()
+    env.counters["ticks"] = 201
+    env.counters["missed"] = 4
+    agent = agent_ledger()
+    agent.counters["policies.adopted"] = 2
+    found = discrepancies(summary_of({**stats, ENV_SERVER: [env], AGENT: [agent]}))
+    assert found == [
+        "ticks = produced + resets: 201 != 200",
+        "published = adopted + rejected + superseded + unused + unreceived: 4 != 5",
+        "missed = sum of its causes: 4 != 3",
+    ]

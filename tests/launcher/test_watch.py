@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import pytest
+
+from launcher.watch import Watch
+from rtcore.channels import ENV_SERVER, LEARNER
+from rtcore.messages import Event
+from tests.launcher.ledgers import episode, ledger, notice
+
+SECOND = 1_000_000_000
+
+
+def test_rates_are_over_the_last_two_seconds() -> None:
+    watch = Watch(100.0)
+    assert watch.rate(ENV_SERVER, "ticks") is None
+    ticks = 0
+    for quarter in range(40):
+        ticks += 25 if quarter < 20 else 50
+        stats = ledger(ENV_SERVER, seq=quarter, at_ns=quarter * SECOND // 4, counters={"ticks": ticks})
+        watch.feed(stats, received_ns=stats.at_ns)
+        if quarter == 0:
+            assert watch.rate(ENV_SERVER, "ticks") is None
+        if quarter == 19:
+            assert watch.rate(ENV_SERVER, "ticks") == 100.0
+    assert watch.rate(ENV_SERVER, "ticks") == 200.0
+
+
+def test_a_restart_begins_a_rate_anew_and_keeps_the_old_ledger() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, at_ns=SECOND, counters={"ticks": 100}), 1)
+    watch.feed(ledger(ENV_SERVER, incarnation=2, at_ns=2 * SECOND, counters={"ticks": 10}), 2)
+    assert watch.rate(ENV_SERVER, "ticks") is None
+    assert watch.totals(ENV_SERVER).counters["ticks"] == 110
+
+
+def test_returns_are_kept_though_messages_carry_only_the_newest() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, seq=0, returns=[episode(0, 1.0), episode(1, 2.0)]), 1)
+    watch.feed(ledger(ENV_SERVER, seq=1, returns=[episode(1, 2.0), episode(2, 3.0)]), 2)
+    (kept,) = watch.stats()[ENV_SERVER]
+    assert [one.value for one in kept.returns] == [1.0, 2.0, 3.0]
+
+
+def test_an_overtaken_message_changes_nothing() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, seq=5, counters={"ticks": 50}), 1)
+    watch.feed(ledger(ENV_SERVER, seq=4, counters={"ticks": 40}), 2)
+    assert watch.totals(ENV_SERVER).counters["ticks"] == 50
+
+
+def test_the_final_ledger_replaces_what_was_heard() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, seq=5, counters={"ticks": 50}), 1)
+    watch.feed_final(
+        [ledger(ENV_SERVER, seq=6, final=True, counters={"ticks": 60}, returns=[episode(0, 1.0)])]
+    )
+    (kept,) = watch.stats()[ENV_SERVER]
+    assert kept.final
+    assert kept.counters == {"ticks": 60}
+    assert [one.value for one in kept.returns] == [1.0]
+
+
+@pytest.mark.parametrize(("age_s", "health"), [(0.5, "alive"), (3.0, "late"), (60.0, "missing")])
+def test_health_follows_from_the_last_message(age_s: float, health: str) -> None:
+    watch = Watch(100.0)
+    assert watch.health(ENV_SERVER, 0) == "missing"
+    watch.feed(ledger(ENV_SERVER), received_ns=SECOND)
+    assert watch.health(ENV_SERVER, SECOND + int(age_s * SECOND)) == health
+
+
+def test_events_and_the_phase() -> None:
+    watch = Watch(100.0)
+    assert watch.phase() is None
+    event = Event(at_ns=1, level="WARN", text="hello")
+    watch.feed(ledger(LEARNER, windows=[notice(0, "update"), notice(0, "hold")], events=[event]), 1)
+    phase = watch.phase()
+    assert phase is not None
+    assert phase.phase == "hold"
+    assert list(watch.events) == [(LEARNER, event)]
