@@ -8,7 +8,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed-$(shell cat requirements.lock pyproject.toml | cksum | cut -d ' ' -f 1)
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input
+PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --no-input
 
 .DEFAULT_GOAL := help
 .PHONY: help run test check clean
@@ -34,12 +34,13 @@ clean:
 
 # The stamp carries the hash of what is to be installed, so a changed lock file installs again.
 $(STAMP): requirements.lock pyproject.toml
-	@command -v $(PYTHON) >/dev/null || { echo "tenuto: PYTHON = $(PYTHON): must name a Python 3.11 interpreter" >&2; exit 1; }
-	@echo "[1/3] environment: .venv ($(PYTHON))"
-	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@echo "[2/3] packages: requirements.lock, several minutes the first time"
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "tenuto: PYTHON = $(PYTHON): must be a Python 3.11 interpreter" >&2; exit 2; }
+	@echo "[1/3] environment in .venv"
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear .venv
+	@echo "[2/3] packages of requirements.lock (the first time this takes some minutes)"
 	@$(PIP) -r requirements.lock
-	@echo "[3/3] tenuto itself"
+	@echo "[3/3] tenuto"
 	@$(PIP) --no-deps --no-build-isolation -e .
 	@rm -f .venv/.installed-*
 	@touch $@

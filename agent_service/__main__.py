@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import sys
+
 from agent_service.service import AgentService
 from rtcore import channels
-from rtcore.process import background, open_process
+from rtcore.process import Process, background, run_process
 
 
-def main() -> None:
-    """Open, act, close."""
-    with open_process(channels.AGENT) as process:
-        service = AgentService(process.config, process.bus, process.clock, process.ledger)
-        process.bus.serve(channels.AGENT, service.command)
-        process.bus.declare_alive(channels.AGENT)
-        try:
-            with background(service.check_policies, name="policies"):
-                service.run(process.stop)
-        finally:
-            service.close()
+def serve(process: Process) -> None:
+    """Act, then account for what never acted."""
+    service = AgentService(process.config, process.bus, process.clock, process.ledger)
+    process.bus.serve(channels.AGENT, service.command)
+    process.bus.declare_alive(channels.AGENT)
+    with background(service.check_policies, name="policies"):
+        service.run(process.stop)
+    service.close()
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_process(channels.AGENT, serve))

@@ -75,7 +75,7 @@ class Journal:
                 self._ledger.count("log.errors")
                 self._complaints.warning("log path: %s; %d steps wait", error, len(self._waiting))
 
-    def close(self, timeout_s: float = 3.0) -> None:
+    def close(self, timeout_s: float = 2.0) -> None:
         """Send what waits and the word that nothing follows. A second close does nothing.
 
         Args:

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from launcher.cli import DONE, FAILED, INTERRUPTED, CommandError
 from launcher.screen import Screen
 from launcher.summary import Summary, summarise
 from launcher.supervisor import End, Interrupts, Supervisor, command_for
+from launcher.viewer import Viewer
 from launcher.watch import Watch
 from rtcore import channels
 from rtcore.bus import Bus, BusError
@@ -81,23 +83,28 @@ def _carry_out(
     wanted = [name for name in channels.PROCESSES if name != channels.RECORDER or config.recorder.record]
     supervisor = Supervisor({name: command_for(name, run_dir.path) for name in wanted}, run_dir.logs_dir)
     interrupts = Interrupts()
+    viewer = Viewer(config.recorder, run_dir.logs_dir / "viewer.out")
     with interrupts.counted(), supervisor.started():
         os.nice(NICENESS)
         with (
             open_bus("client", run_dir.run_name, run_dir.socket_dir(), clock=clock) as bus,
+            closing(viewer),
             screen.shown(),
         ):
-            return _watch_over(supervisor, interrupts, bus, watch, screen)
+            return _watch_over(supervisor, interrupts, bus, watch, screen, viewer)
 
 
 def _watch_over(
-    supervisor: Supervisor, interrupts: Interrupts, bus: Bus, watch: Watch, screen: Screen
+    supervisor: Supervisor, interrupts: Interrupts, bus: Bus, watch: Watch, screen: Screen, viewer: Viewer
 ) -> End:
     ledgers = bus.queue(channels.STATS, "*")
 
     def poll(waiting_for: frozenset[str]) -> None:
         for received in ledgers.drain():
             watch.feed(received.message, received.received_ns)
+        if viewer.due and watch.heard(channels.RECORDER):
+            viewer.open()
+            screen.say(f"view {viewer.address}")
         if waiting_for:
             screen.note = "ending: " + ", ".join(name for name in channels.PROCESSES if name in waiting_for)
         screen.update()

@@ -92,6 +92,10 @@ class Screen:
             self._due_ns = now_ns + REFRESH_NS
             self._live.update(self.render(), refresh=True)
 
+    def say(self, text: str) -> None:
+        """Print a line that stays, above the screen."""
+        self._console.print(text, highlight=False, soft_wrap=True)
+
     def line(self) -> str:
         """The state in one line."""
         now = self._read()
@@ -141,9 +145,9 @@ class Screen:
     def _state(self, process: str) -> str:
         if self._watch.ended(process):
             return "ended"
-        seen = self._watch.rate(process, "messages.rejected") is not None
-        state = self._watch.health(process, self._clock.now_ns())
-        return "starting" if state == "missing" and not seen else state
+        if not self._watch.heard(process):
+            return "starting"
+        return self._watch.health(process, self._clock.now_ns())
 
     def _progress(self, now: Now) -> RenderableType:
         total_s = self._config.duration_s

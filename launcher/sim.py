@@ -41,6 +41,7 @@ class Simulation:
         clock, ledgers = self._clock, self.ledgers
         world = make_world(config.env, config.seed)
         stack.callback(world.close)
+        world.save_scene(run_dir.world_path)
         self.env = EnvService(
             config,
             world,

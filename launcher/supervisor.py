@@ -20,7 +20,7 @@ Reason = Literal["duration", "interrupted", "failed", "killed"]
 
 POLL_S = 0.05
 INTERRUPTED_LIMIT_S = 4.5  # from Ctrl-C to the last kill; the summary fits into what is left of 5 s
-ENDING_LIMIT_S = 15.0  # when nobody is waiting: a long recording takes seconds to finish
+ENDING_LIMIT_S = 20.0  # when nobody is waiting: the recorder may take 10 s to compact a long recording
 TAIL_LINES = 12
 
 # The world ends first, then who depends on what it sent. A process gets its SIGTERM when all before

@@ -89,6 +89,10 @@ class Watch:
             return None
         return (last.counters.get(counter, 0) - first.counters.get(counter, 0)) / span_s
 
+    def heard(self, process: str) -> bool:
+        """Whether anything ever came from it."""
+        return process in self._seen_ns
+
     def health(self, process: str, now_ns: int) -> Health:
         """By the stats channel's row: how long ago the process last spoke."""
         return health(channels.STATS, self._hz, self._seen_ns.get(process), now_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 
 from learner.replay import Replay
@@ -40,10 +41,21 @@ class Intake:
     def meet(self, spec: Spec, replay: Replay) -> None:
         """Learn the shapes and the action space; until then everything waits in the queue."""
         self._replay = replay
-        self._transitions = Transitions(spec.observation_dim, spec.action_dim)
+        self._dims = (spec.observation_dim, spec.action_dim)
+        self._transitions = Transitions(*self._dims)
         low, high = np.asarray(spec.action_low), np.asarray(spec.action_high)
         self._middle = ((high + low) / 2).astype(np.float32)
         self._half_span = ((high - low) / 2).astype(np.float32)
+
+    def place(self) -> str:
+        """Where in the log the intake stands, for `go_on_from` in a later learner."""
+        return msgspec.json.encode((self._log.stream.position, self._transitions.previous)).decode()
+
+    def go_on_from(self, place: str) -> None:
+        """Go on right after what an earlier learner took in. Call it after `meet`."""
+        position, previous = msgspec.json.decode(place, type=tuple[tuple[int, int] | None, Step | None])
+        self._log.go_on_from(position)
+        self._transitions = Transitions(*self._dims, previous)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until something has come, at most so long."""

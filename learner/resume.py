@@ -6,21 +6,25 @@ import msgspec
 
 from learner import checkpoint
 from learner.algorithm import Algorithm
+from learner.intake import Intake
 from rtcore.messages import Policy
 from rtcore.run_dir import RunDir
 
 CHECKPOINT_DIR = "checkpoint"  # in the learner's directory, as are the others
 REPLAY_DIR = "replay"
+PLACE = "intake"  # the checkpoint's scalar that says where in the log it was made
 POLICY_FILE = "policy.msgpack"  # the newest published policy, as it went over the bus
 
 
-def save(run_dir: RunDir, algorithm: Algorithm) -> None:
+def save(run_dir: RunDir, algorithm: Algorithm, intake: Intake) -> None:
     """Write the checkpoint, in place of an older one."""
-    checkpoint.save(run_dir.learner_dir / CHECKPOINT_DIR, algorithm.state())
+    state = algorithm.state()
+    state.scalars[PLACE] = intake.place()
+    checkpoint.save(run_dir.learner_dir / CHECKPOINT_DIR, state)
 
 
-def restore(run_dir: RunDir, algorithm: Algorithm) -> bool:
-    """Load the run's checkpoint into `algorithm`; False if there is none.
+def restore(run_dir: RunDir, algorithm: Algorithm, intake: Intake) -> bool:
+    """Load the run's checkpoint, if there is one; say whether there was.
 
     Raises:
         CheckpointError: there is one, and it is damaged or does not fit the configuration.
@@ -28,7 +32,10 @@ def restore(run_dir: RunDir, algorithm: Algorithm) -> bool:
     directory = run_dir.learner_dir / CHECKPOINT_DIR
     if not checkpoint.exists(directory):
         return False
-    algorithm.load(checkpoint.load(directory))
+    state = checkpoint.load(directory)
+    place = state.scalars.pop(PLACE)
+    algorithm.load(state)
+    intake.go_on_from(place)
     return True
 
 

@@ -86,9 +86,10 @@ class LearnerService:
     def step(self) -> bool:
         """Take in, keep the schedule, make at most one gradient step. Says whether it made one."""
         self._take_in()
-        if self._spec is None or self._algorithm is None or self._over(self._spec):
+        if self._spec is None or self._algorithm is None:
             return False
-        self._keep_schedule(self._spec)
+        if not self._over(self._spec):
+            self._keep_schedule(self._spec)
         if not self._budget.allows():
             return False
         begin_ns = self._clock.now_ns()
@@ -117,7 +118,7 @@ class LearnerService:
         self._intake.finish()
         if self._algorithm is not None:
             self._ledger_metrics(self._algorithm)
-            resume.save(self._run_dir, self._algorithm)
+            resume.save(self._run_dir, self._algorithm, self._intake)
 
     # ---- turning the crank
 
@@ -143,7 +144,7 @@ class LearnerService:
         self._intake.meet(spec, replay)
         seed = self._config.seed * 10 + LEARNER_STREAM
         self._algorithm = make_algorithm(learner, spec.observation_dim, spec.action_dim, seed, replay)
-        if resume.restore(self._run_dir, self._algorithm):
+        if resume.restore(self._run_dir, self._algorithm, self._intake):
             version = resume.last_published(self._run_dir)
             self._publication.go_on_from(version)
             text = f"goes on from the checkpoint: policy {version}, {len(replay)} transitions in the replay"
@@ -201,7 +202,7 @@ class LearnerService:
     # ---- small things
 
     def _over(self, spec: Spec) -> bool:
-        """Whether the run has ended: windows and learning end with the world."""
+        """Whether the run has ended: no window begins after the world's end."""
         duration_ns = round(self._config.duration_s * 1e9)
         over = 0 < duration_ns <= self._clock.now_ns() - spec.t0_ns
         return over or self._intake.ended

@@ -1,9 +1,17 @@
-"""Messages to bytes and back, with everything refused counted: what both buses share."""
+"""Messages to bytes and back, with everything refused counted: what both buses share.
+
+On the wire a message is its msgpack encoding and, after that, the CRC-32 of it. Zenoh (1.10) sends a
+message that does not fit into the rest of a batch in fragments; when it gives up a link in the middle of one,
+because a reader stalled or the session closes, the receiver may get the beginning of one message with the
+end of another. Measured: 8 of 8 readers that stalled for over a second under a full queue, and 1 of these
+messages decoded, as a batch of steps that never were.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from typing import Generic
@@ -14,6 +22,8 @@ from rtcore.channels import Channel, MessageT
 from rtcore.lifecycle import RateLimited
 
 LOG_PERIOD_S = 10.0  # a flood of bad messages writes one line per channel and period
+
+CRC_BYTES = 4
 
 _FORBIDDEN_IN_NAME = frozenset("/*$#?@")  # they mean something in a key
 
@@ -68,16 +78,19 @@ class Rejections:
             return dict(self._counts)
 
 
+def seal(encoded: bytes) -> bytes:
+    """Append the CRC-32, little-endian."""
+    return encoded + zlib.crc32(encoded).to_bytes(CRC_BYTES, "little")
+
+
 class Codec(Generic[MessageT]):
-    """Encodes and decodes one channel's messages within its limits."""
+    """Encodes and decodes one channel's messages within its limits. Usable from any thread."""
 
     def __init__(self, channel: Channel[MessageT], rejections: Rejections) -> None:
         self._channel = channel
         self._rejections = rejections
-        # Measured on a Step of 300 B: 0.5 us here, 0.3 us with encode_into a shared buffer, beside a put
-        # of 10 us and more. Fresh bytes need no lock between threads.
         self._encode = msgspec.msgpack.Encoder().encode
-        self._decoder = msgspec.msgpack.Decoder(channel.type)
+        self._decode = msgspec.msgpack.Decoder(channel.type).decode
 
     def encode(self, message: MessageT) -> bytes:
         """The message as bytes.
@@ -91,7 +104,7 @@ class Codec(Generic[MessageT]):
             raise TypeError(
                 f"channel {channel.name} carries {channel.type.__name__}, not {type(message).__name__}"
             )
-        payload = self._encode(message)
+        payload = seal(self._encode(message))
         if len(payload) > channel.max_bytes:
             size = f"{len(payload)} bytes"
             raise ValueError(
@@ -106,10 +119,20 @@ class Codec(Generic[MessageT]):
         self._rejections.count(self._channel.name, f"{size} bytes: at most {self._channel.max_bytes} allowed")
         return False
 
+    def intact(self, payload: bytes) -> bool:
+        """Whether the bytes are those that were sent; counts them if not."""
+        encoded = memoryview(payload)[:-CRC_BYTES]
+        if zlib.crc32(encoded) == int.from_bytes(payload[-CRC_BYTES:], "little") and encoded:
+            return True
+        self._rejections.count(self._channel.name, f"{len(payload)} bytes with a wrong checksum")
+        return False
+
     def decode(self, payload: bytes) -> MessageT | None:
         """The message, or None (and one more on the count) if the bytes are not a valid one."""
+        if not self.intact(payload):
+            return None
         try:
-            return self._decoder.decode(payload)
+            return self._decode(memoryview(payload)[:-CRC_BYTES])
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             self._rejections.count(self._channel.name, error)
             return None

@@ -22,6 +22,10 @@ class LogReader:
         self._waiting_since_ns: int | None = None  # a step is missing since then
         self.stream = StepStream()
 
+    def go_on_from(self, position: tuple[int, int] | None) -> None:
+        """Begin at this (incarnation, seq), where an earlier reader ended. Call it before reading."""
+        self.stream = StepStream(position)
+
     @property
     def ended(self) -> bool:
         """Whether the env server ended in order and everything before its end was read."""

@@ -2,8 +2,9 @@
 
 Zenoh's own history (1.10) covers publishers that are there when a reader is declared. One that comes
 later, as after a restart, may deliver its first live message before its history; Zenoh then throws
-the history away (measured: the first 0.2 to 0.4 s of a restarted publisher were lost). So a publisher
-whose first message is not its number 0 is held back until what came before has been asked for.
+the history away (measured: the first 24 of 150 messages, each time). And a message that arrives damaged
+counts as delivered for Zenoh. So whenever numbers are missing, what comes after them is held back until they
+have been asked for, once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ HELD_LIMIT = 4096  # live messages held back at most; twice a publisher's cache
 @dataclass(slots=True)
 class _Source(Generic[T]):
     next: int = 0  # the number that comes next; everything below was delivered or is lost
-    fetching: bool = False
+    fetching: bool = False  # what comes is held until the missing numbers are there
     held: dict[int, T] = field(default_factory=dict)
 
 
@@ -33,25 +34,24 @@ class SourceOrder(Generic[T]):
         self._lock = threading.Lock()
         self._sources: dict[str, _Source[T]] = {}
 
-    def live(self, source: str, number: int, item: T) -> bool:
-        """Take a live item. True: the caller must now fetch numbers 0 to `number` - 1 of this source,
-        hand them to `history`, and call `fetched` when no more will come.
-
-        A gap further on is passed over: Zenoh has then tried to recover it, and readers count it.
+    def live(self, source: str, number: int, item: T) -> tuple[int, int] | None:
+        """Take a live item. A result means: fetch this source's numbers from the first to the second, hand
+        them to `history`, and call `fetched` when no more will come.
         """
         with self._lock:
-            state = self._sources.get(source)
-            must_fetch = state is None and number > 0
-            if state is None:
-                state = self._sources[source] = _Source(fetching=must_fetch)
+            state = self._sources.setdefault(source, _Source())
             if state.fetching:
                 state.held.setdefault(number, item)
                 if len(state.held) >= HELD_LIMIT:
                     self._release(state)
-            elif number >= state.next:
+            elif number == state.next:
                 state.next = number + 1
                 self._deliver(item)
-            return must_fetch
+            elif number > state.next:
+                state.fetching = True
+                state.held[number] = item
+                return state.next, number - 1
+            return None
 
     def history(self, source: str, number: int, item: T) -> None:
         """Take a fetched item; one that comes too late is ignored."""
@@ -68,5 +68,6 @@ class SourceOrder(Generic[T]):
     def _release(self, state: _Source[T]) -> None:
         held, state.held, state.fetching = state.held, {}, False
         for number in sorted(held):
-            state.next = number + 1
-            self._deliver(held[number])
+            if number >= state.next:
+                state.next = number + 1
+                self._deliver(held[number])

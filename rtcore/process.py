@@ -1,15 +1,15 @@
 """What the four processes have in common: arguments, placement, bus, ledger, signals, and the end.
 
-    with open_process(channels.AGENT) as process:
-        ...
+    sys.exit(run_process(channels.AGENT, serve))
 
-Leaving the block publishes and writes the process's final stats, whatever happened inside.
+Whatever happens in `serve`, the process's final stats are published and written.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rtcore import channels, realtime
-from rtcore.bus import Bus
+from rtcore.bus import Bus, BusError
 from rtcore.clock import Clock
-from rtcore.config import RunConfig
+from rtcore.config import ConfigError, RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop, die_with_parent, log_to_file, stop_on_signals
 from rtcore.messages import Stats
@@ -28,6 +28,8 @@ from rtcore.run_dir import RunDir
 from rtcore.zenoh_bus import open_bus
 
 REPORT_PERIOD_S = 0.25  # the rate in the channel table
+JOIN_LIMIT_S = 2.0  # a thread blocked in a put is left behind, so that a process ends within 5 s
+DONE, FAILED, WRONG_INPUT = 0, 1, 2  # exit codes
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,25 @@ def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--supervised", action="store_true", help="end when the parent process ends")
     return parser.parse_args(argv)
+
+
+def run_process(role: str, serve: Callable[[Process], None], argv: Sequence[str] | None = None) -> int:
+    """Open everything a process needs, serve, and close it in order.
+
+    Returns:
+        The exit code: 0 done; 2 wrong input, with one line on stderr that says what is wrong; 1 when
+        real-time scheduling is required and refused, or the bus cannot be joined.
+    """
+    try:
+        with open_process(role, argv) as process:
+            serve(process)
+    except ConfigError as error:
+        sys.stderr.write(f"{role}: {error}\n")
+        return WRONG_INPUT
+    except (realtime.RealtimeError, BusError) as error:
+        sys.stderr.write(f"{role}: {error}\n")
+        return FAILED
+    return DONE
 
 
 @contextmanager
@@ -142,4 +163,4 @@ def background(loop: Callable[[Stop], None], *, name: str) -> Iterator[None]:
         yield
     finally:
         stop.set(f"{name} ends")
-        thread.join(timeout=5.0)
+        thread.join(timeout=JOIN_LIMIT_S)

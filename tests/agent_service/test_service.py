@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -131,10 +134,7 @@ def test_a_policy_that_never_acted_is_superseded_and_a_repeat_counts_apart(rig: 
 
 
 def spoiled_hash(version: int) -> Policy:
-    good = policy(version)
-    return Policy(
-        **{name: getattr(good, name) for name in good.__struct_fields__ if name != "sha256"}, sha256="0" * 64
-    )
+    return msgspec.structs.replace(policy(version), sha256="0" * 64)
 
 
 def spoiled_weights(version: int) -> Policy:
@@ -147,7 +147,7 @@ def other_shape(version: int) -> Policy:
 
 
 @pytest.mark.parametrize("make", [spoiled_hash, spoiled_weights, other_shape])
-def test_a_bad_policy_is_refused_and_the_old_one_goes_on(rig: Rig, make) -> None:  # type: ignore[no-untyped-def]
+def test_a_bad_policy_is_refused_and_the_old_one_goes_on(rig: Rig, make: Callable[[int], Policy]) -> None:
     rig.specs.put(SPEC)
     rig.answer(step(0))
     rig.policies.put(policy(1, mean_bias=0.5))
@@ -180,8 +180,6 @@ def test_a_restarted_environment_is_answered_once_it_declares_itself(rig: Rig) -
     rig.specs.put(SPEC)
     rig.answer(step(0))
     assert rig.answer(step(0, incarnation=8)) is None
-    rig.specs.put(
-        Spec(**{n: getattr(SPEC, n) for n in SPEC.__struct_fields__ if n != "incarnation"}, incarnation=8)
-    )
+    rig.specs.put(msgspec.structs.replace(SPEC, incarnation=8))
     answer = rig.answer(step(1, incarnation=8))
     assert answer is not None and answer.incarnation == 8

@@ -114,6 +114,9 @@ class _Hoarder(gymnasium.Env[Any, Any]):
     observation_space = Box(-9, 9, (2, 2))
     action_space = Box(-1, 1, (2, 1), np.float64)
 
+    def __init__(self, **_options: Any) -> None:
+        self.state = np.zeros((2, 2), np.float32)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         self.state = np.zeros((2, 2), np.float32)
         return self.state, {}

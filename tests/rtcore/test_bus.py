@@ -17,6 +17,7 @@ import pytest
 from rtcore import channels
 from rtcore.bus import BusClosedError, NoAnswerError
 from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, STATS, STEP, Channel
+from rtcore.codec import seal
 from rtcore.messages import Command, CommandReply
 from tests.rtcore.bus_samples import (
     ENV,
@@ -231,6 +232,17 @@ def test_random_bytes_are_counted_and_the_loop_goes_on(world: World) -> None:
     assert latest.take() is not None
 
 
+def test_a_damaged_message_is_rejected_though_it_decodes(world: World) -> None:
+    agent = world.bus(AGENT)
+    queue = agent.queue(STEP, ENV)
+    first, second = (seal(msgspec.msgpack.encode(step(seq))) for seq in (1, 2))
+    assert len(first) == len(second)
+    world.inject(channels.STEP.key_for(ENV), first[:100] + second[100:])
+    assert queue.wait(5.0)
+    assert queue.drain() == []
+    assert agent.rejected() == {"step": 1}
+
+
 def test_a_bad_message_does_not_end_a_wait(world: World) -> None:
     env, agent = world.bus(ENV_SERVER), world.bus(AGENT)
     latest, counter = agent.latest(STEP, ENV), agent.queue(STEP, ENV)
@@ -250,7 +262,7 @@ def test_a_bad_message_does_not_end_a_wait(world: World) -> None:
 def test_a_message_of_another_type_is_rejected(world: World) -> None:
     agent = world.bus(AGENT)
     queue = agent.queue(STEP, ENV)
-    world.inject(channels.STEP.key_for(ENV), msgspec.msgpack.encode(action()))
+    world.inject(channels.STEP.key_for(ENV), seal(msgspec.msgpack.encode(action())))
     assert queue.wait(5.0)
     assert queue.drain() == []
     assert agent.rejected() == {"step": 1}
@@ -267,7 +279,7 @@ def test_an_oversized_message_is_refused_by_the_sender(world: World) -> None:
 def test_an_oversized_message_is_dropped_by_the_receiver(world: World) -> None:
     env = world.bus(ENV_SERVER)
     latest, queue = env.latest(ACTION, ENV), env.queue(ACTION, ENV)
-    world.inject(channels.ACTION.key_for(ENV), msgspec.msgpack.encode(action(values=bytes(40_000))))
+    world.inject(channels.ACTION.key_for(ENV), seal(msgspec.msgpack.encode(action(values=bytes(40_000)))))
     assert eventually(lambda: env.rejected() == {"action": 2})
     assert latest.take() is None
     assert queue.drain() == []

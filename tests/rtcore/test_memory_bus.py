@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rtcore import channels, commands
 from rtcore.channels import LOG, STATS, STEP
 from rtcore.clock import VirtualClock
-from rtcore.codec import Codec, Rejections
+from rtcore.codec import Codec, Rejections, seal
 from rtcore.inbox import QueueInbox, ThreadBell
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Command, CommandReply, Message
@@ -94,13 +94,16 @@ def test_no_bytes_whatever_raise_in_decode(channel: channels.Channel[Message]) -
             st.builds(lambda at, byte: valid[:at] + byte + valid[at + 1 :], st.integers(0, 400), st.binary()),
         )
     )
-    def decode(payload: bytes) -> None:
-        message = codec.decode(payload)
+    def decode(encoded: bytes) -> None:
+        assert codec.decode(encoded) is None  # no checksum
+        message = codec.decode(seal(encoded))
         assert message is None or isinstance(message, channel.type)
 
     decode()
-    assert codec.decode(b"\x91" * 100_000) is None  # nested beyond any stack
-    assert codec.decode(valid) == SAMPLES[channel.name][1]
+    assert codec.decode(b"") is None
+    assert codec.decode(seal(b"")) is None
+    assert codec.decode(seal(b"\x91" * 100_000)) is None  # nested beyond any stack
+    assert codec.decode(seal(valid)) == SAMPLES[channel.name][1]
 
 
 def test_rejections_are_counted_each_and_logged_at_a_limited_rate(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,0 +1,190 @@
+"""The learner service on a virtual clock, fed by hand over the in-memory bus."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.checkpoint import CheckpointError
+from learner.service import LearnerService
+from rtcore import channels
+from rtcore.clock import VirtualClock
+from rtcore.config import DriftConfig, EnvConfig, LearnerConfig, RunConfig, ScheduleConfig
+from rtcore.ledger import Ledger
+from rtcore.memory_bus import MemoryHub
+from rtcore.messages import Command, Policy, Spec, Step, StepBatch
+from rtcore.run_dir import RunDir
+from rtcore.weights import verify
+
+TICK_NS, UNIT_NS = 100_000_000, 1_000_000_000  # ten ticks a unit
+SPEC = Spec(
+    env="env0", env_id="test", incarnation=7, t0_ns=0, wall_t0_ns=0, tick_ns=TICK_NS, unit_ns=UNIT_NS,
+    observation_dim=2, action_dim=1, action_low=[-4.0], action_high=[0.0],
+)  # fmt: skip
+CONFIG = RunConfig(
+    duration_s=0.0,
+    env=EnvConfig(id="pointmass", hz=10.0, drift=DriftConfig(kind="none")),
+    learner=LearnerConfig(
+        hidden=(8, 8), batch=16, learning_starts=5, replay_capacity=1000,
+        schedule=ScheduleConfig(l_f=4, gamma_f=0.5),
+    ),
+)  # fmt: skip
+# Windows of 4 units: 2 update, 2 hold.
+
+
+def step(seq: int, *, reset: bool = False) -> Step:
+    observation = np.array([seq, -seq], np.float32).tobytes()
+    action = b"" if reset else np.array([-4.0 + seq % 5], np.float32).tobytes()
+    return Step(
+        env="env0", incarnation=7, seq=seq, tick=seq, episode=0, episode_tick=0 if reset else seq,
+        unit=seq // 10, due_ns=seq * TICK_NS, woke_ns=0, sent_ns=0, observation=observation, reward=1.0,
+        terminated=False, truncated=False, action=action, decision=action, answered_tick=seq - 1,
+        policy_version=0, missed=False, fallback="", cause="", skipped=0, loop_ns=-1, reaction_ns=-1,
+        drift=0.0, position=b"",
+    )  # fmt: skip
+
+
+class Rig:
+    """A learner, its clock, and the other ends."""
+
+    def __init__(self, run_dir: RunDir, config: RunConfig = CONFIG) -> None:
+        hub = MemoryHub()
+        self.clock = VirtualClock(0)
+        self.ledger = Ledger(channels.LEARNER, 1)
+        env = hub.bus(channels.ENV_SERVER, self.clock)
+        self.specs, self.log = env.publisher(channels.SPEC, "env0"), env.publisher(channels.LOG, "env0")
+        self.learner = LearnerService(
+            config, run_dir, hub.bus(channels.LEARNER, self.clock), self.clock, self.ledger
+        )
+        agent = hub.bus(channels.AGENT, self.clock)
+        self.policies, self.windows = agent.queue(channels.POLICY), agent.queue(channels.WINDOW)
+
+    def live(self, first: int, last: int) -> None:
+        """Ticks first..last, one batch each, the learner catching up in between."""
+        for seq in range(first, last + 1):
+            self.clock.sleep_until_ns(seq * TICK_NS)
+            self.log.put(StepBatch(steps=[step(seq, reset=seq == 0)]))
+            self.learner.catch_up()
+
+    def published(self) -> list[Policy]:
+        return [received.message for received in self.policies.drain()]
+
+    def order(self, verb: str) -> str:
+        command = msgspec.convert({"id": verb, "verb": verb}, dict)
+        return self.learner.command(Command(**command)).text
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> RunDir:
+    return RunDir.create(tmp_path / "run", CONFIG)
+
+
+@pytest.fixture
+def rig(run_dir: RunDir) -> Rig:
+    rig = Rig(run_dir)
+    rig.specs.put(SPEC)
+    return rig
+
+
+def test_it_publishes_one_iterate_a_unit_in_update_phases_only(rig: Rig) -> None:
+    rig.live(0, 79)
+    policies = rig.published()
+    assert [(p.version, p.window, p.iterate) for p in policies] == [
+        (1, 0, 1),
+        (2, 0, 2),
+        (3, 1, 1),
+        (4, 1, 2),
+    ]
+    # due 0.1 s, the longest a poll can be away, before the unit ends
+    assert [p.created_ns // TICK_NS for p in policies] == [9, 19, 49, 59]
+    phases = [(n.message.window, n.message.phase, n.message.at_ns // UNIT_NS) for n in rig.windows.drain()]
+    assert phases == [(0, "update", 0), (0, "hold", 2), (1, "update", 4), (1, "hold", 6)]
+    for policy in policies:
+        verify(policy, SPEC.observation_dim, SPEC.action_dim)
+    assert rig.ledger.counter("published_in_hold") == 0
+
+
+def test_critics_go_on_learning_in_the_hold(rig: Rig) -> None:
+    rig.live(0, 29)
+    # 29 transitions, 5 of them before learning starts; units 0 and 1 improve the policy (14 steps)
+    assert rig.ledger.counter("learned") == 29
+    assert rig.ledger.counter("gradient_steps") == 24
+    assert rig.ledger.counter("policy_steps") == 14
+
+
+def test_everything_that_waits_before_the_spec_is_learned_after_it(run_dir: RunDir) -> None:
+    rig = Rig(run_dir)
+    rig.live(0, 9)
+    assert rig.ledger.counter("learned") == 0
+    rig.specs.put(SPEC)
+    rig.live(10, 10)
+    assert rig.ledger.counter("learned") == 10
+
+
+def test_a_repeated_and_a_lost_batch_are_counted(rig: Rig) -> None:
+    rig.live(0, 9)
+    rig.live(5, 9)
+    rig.live(12, 20)  # 10 and 11 are lost
+    rig.clock.advance_ns(6 * UNIT_NS)
+    rig.learner.catch_up()
+    assert (rig.ledger.counter("duplicate"), rig.ledger.counter("gaps")) == (5, 2)
+    assert rig.ledger.counter("broken") == 1  # step 12 has no predecessor
+    assert rig.ledger.counter("learned") == 9 + 8
+
+
+def test_an_operators_hold_withholds_and_resume_publishes_again(run_dir: RunDir) -> None:
+    always = replace(CONFIG.learner, schedule=ScheduleConfig(l_f=4, gamma_f=1.0))
+    rig = Rig(run_dir, replace(CONFIG, learner=always))
+    rig.specs.put(SPEC)
+    rig.live(0, 12)
+    assert rig.order("hold") == "the policy is held"
+    rig.live(13, 32)
+    assert [p.created_ns // TICK_NS for p in rig.published()] == [9]
+    assert rig.ledger.counter("withheld") == 2
+    rig.order("resume")
+    rig.live(33, 39)
+    assert [p.created_ns // TICK_NS for p in rig.published()] == [39]
+    reasons = [(n.message.phase, n.message.reason) for n in rig.windows.drain()]
+    assert reasons == [("update", "schedule"), ("hold", "operator"), ("update", "operator")]
+
+
+def test_a_second_learner_of_the_run_goes_on_from_the_checkpoint(rig: Rig, run_dir: RunDir) -> None:
+    rig.live(0, 19)
+    rig.learner.close()
+    second = Rig(run_dir)
+    second.specs.put(SPEC)
+    second.live(15, 59)  # the log repeats what its cache holds
+    assert second.ledger.counter("learned") == 40  # 20..59; nothing is learned twice, nothing left out
+    assert second.ledger.counter("duplicate") == 5
+    assert [p.version for p in second.published()] == [3, 4]
+    events = [event.text for event in second.ledger.stats(0).events]
+    assert "goes on from the checkpoint: policy 2, 19 transitions in the replay" in events
+
+
+def test_a_checkpoint_of_another_network_is_refused(rig: Rig, run_dir: RunDir) -> None:
+    rig.live(0, 19)
+    rig.learner.close()
+    other = Rig(run_dir, replace(CONFIG, learner=replace(CONFIG.learner, hidden=(8, 4))))
+    other.specs.put(SPEC)
+    with pytest.raises(CheckpointError, match="8, 4"):
+        other.live(20, 21)
+
+
+def test_after_the_duration_nothing_begins(run_dir: RunDir) -> None:
+    rig = Rig(run_dir, replace(CONFIG, duration_s=4.0))
+    rig.specs.put(SPEC)
+    rig.live(0, 39)
+    done = rig.ledger.counter("gradient_steps")
+    rig.clock.sleep_until_ns(5 * UNIT_NS)
+    rig.learner.catch_up()
+    assert rig.ledger.counter("gradient_steps") == done
+    assert [n.message.window for n in rig.windows.drain()] == [0, 0]
+
+
+def test_an_unknown_order_is_refused(rig: Rig) -> None:
+    reply = rig.learner.command(Command(id="1", verb="stop"))
+    assert not reply.ok and "stop" in reply.text
