@@ -27,6 +27,7 @@ import torch
 import tyro
 from stable_baselines3.common.monitor import Monitor
 
+from benchmarks.intervals import half_interval
 from experiments.presets import gym
 from launcher.sim import simulate
 from rtcore.config import RunConfig
@@ -35,7 +36,6 @@ from rtcore.run_dir import RunDir
 
 EPISODE_STEPS = 200
 LAST_EPISODES = 10
-STUDENT_T_975 = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306, 9: 2.262}
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def compare(ours: list[float], theirs: list[float]) -> dict[str, float]:
     """Mean difference and its 95 % Student interval, paired by seed."""
     differences = [a - b for a, b in zip(ours, theirs, strict=True)]
     mean = statistics.fmean(differences)
-    half = STUDENT_T_975[len(differences) - 1] * statistics.stdev(differences) / math.sqrt(len(differences))
+    half = half_interval(differences)
     return {"difference": mean, "low": mean - half, "high": mean + half}
 
 

@@ -63,12 +63,14 @@ class Interrupts:
 
     @contextmanager
     def counted(self) -> Iterator[None]:
-        """Count SIGINT, SIGTERM and SIGHUP inside the block."""
+        """Count SIGINT, SIGTERM and, unless it is ignored as under nohup, SIGHUP inside the block."""
 
         def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signal module's signature
             self.count += 1
 
-        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
         previous = {number: signal.signal(number, handle) for number in numbers}
         try:
             yield

@@ -1,4 +1,4 @@
-"""The live view of a run: a Rerun viewer on the stream that the recorder offers. Best effort, off every path."""
+"""The live view of a run: a Rerun viewer on the stream that the recorder offers."""
 
 from __future__ import annotations
 
@@ -60,5 +60,5 @@ class Viewer:
         """End the browser's server with the run; a window is the person's to close."""
         if self._process is not None and self._config.view == "web":
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGTERM)  # the group: python starts the viewer as a child
+                os.killpg(self._process.pid, signal.SIGKILL)  # the group: python starts the viewer as a child
             self._process.wait()
