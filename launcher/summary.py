@@ -96,7 +96,7 @@ def summarise(
         "loop_us": env.quantiles("loop", 1e-3),
         "policies": _policies(learner, totals[AGENT]),
         "windows": _windows(learner.windows),
-        "operator_holds": sum(one.reason == "operator" and one.phase == "hold" for one in learner.windows),
+        "operator_holds": learner.counters["operator_holds"],
         "transitions": _transitions(env, learner),
         "learner": _learner(learner, _run_time_s(env, config)),
         "forecast": _forecast(learner.gauges),

@@ -12,7 +12,8 @@ class UpdateBudget:
     """Earned by transitions, spent by gradient steps.
 
     Each transition after the first `learning_starts` earns `utd` steps; in a hold, `hold_learning`'s
-    share of it, so that "off" leaves no debt to be worked off when the next window begins.
+    share of it, so that "off" leaves no debt to be worked off when the next window begins. What a
+    learner that is too slow has not spent, it may spend later, but never in a hold that is "off".
     """
 
     def __init__(self, config: LearnerConfig) -> None:
@@ -21,15 +22,19 @@ class UpdateBudget:
         self._hold_share = SHARE[config.hold_learning]
         self._credit = 0.0
 
+    def resume(self, transitions: int) -> None:
+        """Count in what an earlier learner left in the replay; it is no reason for new steps."""
+        self._waiting = max(0, self._waiting - transitions)
+
     def earn(self, transitions: int, phase: Phase) -> None:
         """Take note of new transitions in the replay."""
         late = max(0, transitions - self._waiting)
         self._waiting -= transitions - late
         self._credit += late * self._utd * (1.0 if phase == "update" else self._hold_share)
 
-    def allows(self) -> bool:
-        """Whether one more gradient step may be made."""
-        return self._credit >= 1.0
+    def allows(self, phase: Phase) -> bool:
+        """Whether one more gradient step may be made in this phase."""
+        return self._credit >= 1.0 and (phase == "update" or self._hold_share > 0.0)
 
     def spend(self) -> None:
         """One gradient step was made."""

@@ -66,8 +66,6 @@ class Conductor:
 
     def __init__(self, windows: WindowClock) -> None:
         self._windows = windows
-        self._unit: int | None = None
-        self._window: int | None = None
         self._shown: tuple[int, Phase] | None = None  # window and phase, as last announced
         self._settled = (-1, 0)  # newest iterate that was due: (window, g)
         self._paused = False
@@ -80,50 +78,53 @@ class Conductor:
 
     def pause(self, run_time_ns: int) -> list[Happening]:
         """An operator's hold: no improvement and nothing published until `resume`."""
-        if self._paused:
-            return []
         self._paused = True
         return self._phase_change(run_time_ns, "operator")
 
     def resume(self, run_time_ns: int) -> list[Happening]:
         """Back to what the schedule says."""
-        if not self._paused:
-            return []
         self._paused = False
         return self._phase_change(run_time_ns, "operator")
 
     def advance(self, run_time_ns: int, lead_ns: int) -> list[Happening]:
-        """Everything that happened since the last call, in order."""
+        """Everything that happened since the last call, in order: after a stall, every unit by itself."""
+        found: list[Happening] = []
+        while self.position is not None and self.position.unit_end_ns <= run_time_ns:
+            found += self._enter(self.position.unit_end_ns)
+        if self.position is None:
+            found += self._enter(run_time_ns)
+        assert self.position is not None
+        iterate = (self.position.window.m, self.position.iterate)
+        if self.improving and iterate > self._settled and run_time_ns >= self.position.unit_end_ns - lead_ns:
+            self._settled = iterate
+            found.append(PublishDue(*self._iterate(self.position)))
+        return found
+
+    def _enter(self, run_time_ns: int) -> list[Happening]:
+        """Go to the unit that `run_time_ns` is in: the one after the present one, or the first one."""
         previous, now = self.position, self._windows.position(run_time_ns)
         self.position = now
         found: list[Happening] = []
         if previous is not None:
-            found += [UnitEnded(unit) for unit in range(previous.unit, now.unit)]
-            found += self._overdue(previous, now)
-        if self._window != now.window.m:
-            self._window = now.window.m
-            found.append(WindowEntered(now.window, now.unit))
-        found += self._phase_change(now.phase_start_ns if previous is not None else run_time_ns, "schedule")
-        if self.improving and run_time_ns >= now.unit_end_ns - lead_ns:
-            iterate = (now.window.m, now.iterate)
-            if iterate > self._settled:
+            found.append(UnitEnded(previous.unit))
+            iterate = (previous.window.m, previous.iterate)
+            if previous.phase == "update" and iterate > self._settled:
                 self._settled = iterate
-                found.append(PublishDue(now.window, now.iterate))
-        return found
+                found.append(PublishMissed(*self._iterate(previous)))
+        if previous is None or previous.window.m != now.window.m:
+            found.append(WindowEntered(now.window, now.unit))
+        return found + self._phase_change(run_time_ns, "operator" if self._paused else "schedule")
 
-    def _overdue(self, previous: Position, now: Position) -> list[Happening]:
-        """The iterate of the unit left behind, if its publication was never due while it ran."""
-        iterate = (previous.window.m, previous.iterate)
-        left = (now.window.m, now.unit) != (previous.window.m, previous.unit)
-        if not left or previous.phase != "update" or iterate <= self._settled:
-            return []
-        self._settled = iterate
-        return [PublishMissed(previous.window, previous.iterate)]
+    @staticmethod
+    def _iterate(position: Position) -> tuple[Window, int]:
+        return position.window, position.iterate
 
     def _phase_change(self, start_ns: int, reason: Literal["schedule", "operator"]) -> list[Happening]:
         if self.position is None:
             return []
         phase: Phase = "hold" if self._paused else self.position.phase
+        if phase == self.position.phase == "hold":
+            reason = "schedule"  # an operator's order changes nothing here
         shown = (self.position.window.m, phase)
         if shown == self._shown:
             return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 
 from learner.algorithm import Algorithm
@@ -29,6 +30,7 @@ class Publication:
         self._outbox = outbox
         self._ledger = ledger
         self._version = 0
+        self._created_ns: list[int] = []
         self.improved = False  # since the last one
 
     def go_on_from(self, version: int) -> None:
@@ -51,9 +53,8 @@ class Publication:
         self._version += 1
         self.improved = False
         self._ledger.count("published")
+        self._created_ns.append(created_ns)
         self._ledger.set_counter("last_version", self._version)
-        if announced_phase(self._notices, created_ns) == "hold":
-            self._ledger.count("published_in_hold")
         policy = Policy(
             version=self._version,
             window=due.window.m,
@@ -66,6 +67,11 @@ class Publication:
         )
         self._outbox.put(policy)
 
+    def check(self) -> None:
+        """Hold the stamps against the phases as announced: `published_in_hold` must stay 0."""
+        in_hold = sum(announced_phase(self._notices, stamp) == "hold" for stamp in self._created_ns)
+        self._ledger.set_counter("published_in_hold", in_hold)
+
     def withhold(self, window: int, iterate: int, now_ns: int) -> None:
         """Account for an iterate that came too late."""
         if self.improved:
@@ -74,10 +80,9 @@ class Publication:
 
 
 def announced_phase(notices: Sequence[WindowNotice], at_ns: int) -> Phase:
-    """The phase at an instant, by the notices alone; before the first it is an update phase."""
-    phase: Phase = "update"
-    for notice in notices:
-        if notice.at_ns > at_ns:
-            break
-        phase = notice.phase
-    return phase
+    """The phase at an instant, by the notices alone, oldest first; before the first it is an update phase.
+
+    A stamp on the boundary belongs to the phase that ends there (stamp <= t_m + G_m).
+    """
+    before = bisect_left(notices, at_ns, key=lambda notice: notice.at_ns)
+    return notices[before - 1].phase if before else "update"

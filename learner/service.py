@@ -31,7 +31,7 @@ from rtcore.clock import Clock
 from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
-from rtcore.messages import Command, CommandReply, Spec, WindowNotice
+from rtcore.messages import Command, CommandReply, Phase, Spec, WindowNotice
 from rtcore.run_dir import RunDir
 from rtcore.windows import WindowClock, make_schedule
 
@@ -60,6 +60,7 @@ class LearnerService:
         self._publication = Publication(config.learner.algo, self._notices, self.outbox, ledger)
         self._orders: list[str] = []  # from the bus's thread; carried out between two steps
         self._spec: Spec | None = None
+        self._on_time = False  # the learner was there before T0: the first window begins on the dot
         self._algorithm: Algorithm | None = None
         self._lead_ns = LEAD_FLOOR_NS
         self._step_ns = 0
@@ -68,12 +69,15 @@ class LearnerService:
     def run(self, stop: Stop) -> None:
         """Learn until stopped, then take what the env server still sends."""
         while not stop.is_set():
-            if not self.step():
+            if self._spec is None:
+                stop.wait(IDLE_WAIT_S)  # the log may be there already, and would not let us wait
+                self.step()
+            elif not self.step():
                 self._intake.wait(IDLE_WAIT_S)
             elif self._at_half_power():
                 stop.wait(self._step_ns / 1e9)
         deadline = time.monotonic() + DRAIN_LIMIT_S
-        while not self._intake.ended and time.monotonic() < deadline:
+        while self._spec is not None and not self._intake.ended and time.monotonic() < deadline:
             self._intake.wait(IDLE_WAIT_S)
             self._take_in()
 
@@ -90,10 +94,12 @@ class LearnerService:
             return False
         if not self._over(self._spec):
             self._keep_schedule(self._spec)
-        if not self._budget.allows():
+        elif not self._intake.ended:
+            return False  # what still comes is taken in; nothing is learned after the end
+        if not self._budget.allows(self._phase):
             return False
         begin_ns = self._clock.now_ns()
-        improve = self._conductor.improving
+        improve = self._phase == "update"
         self._algorithm.update(improve_policy=improve)
         self._budget.spend()
         self._publication.improved |= improve
@@ -109,13 +115,14 @@ class LearnerService:
             return CommandReply(id=command.id, ok=True, text=self._describe())
         if command.verb in ("hold", "resume"):
             self._orders.append(command.verb)
-            done = "the policy is held" if command.verb == "hold" else "the schedule goes on"
+            done = "the policy will be held" if command.verb == "hold" else "the schedule will go on"
             return CommandReply(id=command.id, ok=True, text=done)
         return CommandReply(id=command.id, ok=False, text=f"the learner knows no '{command.verb}'")
 
     def close(self) -> None:
         """Account for what never came, and write the checkpoint."""
         self._intake.finish()
+        self._publication.check()
         if self._algorithm is not None:
             self._ledger_metrics(self._algorithm)
             resume.save(self._run_dir, self._algorithm, self._intake)
@@ -130,12 +137,13 @@ class LearnerService:
             return
         learned = self._intake.take(self._clock.now_ns())
         if learned:
-            phase = self._conductor.position.phase if self._conductor.position else "update"
-            self._budget.earn(learned, phase)
+            self._budget.earn(learned, self._phase)
 
     def _meet(self, spec: Spec) -> None:
         if self._spec is not None:
-            self._ledger.event(self._clock.now_ns(), "WARN", "the env server came back; its clock is kept")
+            if spec.incarnation != self._spec.incarnation:
+                text = "the env server came back; units and windows go on by its first clock"
+                self._ledger.event(self._clock.now_ns(), "WARN", text)
             return
         self._spec = spec
         learner = self._config.learner
@@ -144,9 +152,10 @@ class LearnerService:
         self._intake.meet(spec, replay)
         seed = self._config.seed * 10 + LEARNER_STREAM
         self._algorithm = make_algorithm(learner, spec.observation_dim, spec.action_dim, seed, replay)
+        version = resume.last_published(self._run_dir)
+        self._publication.go_on_from(version)
         if resume.restore(self._run_dir, self._algorithm, self._intake):
-            version = resume.last_published(self._run_dir)
-            self._publication.go_on_from(version)
+            self._budget.resume(len(replay))
             text = f"goes on from the checkpoint: policy {version}, {len(replay)} transitions in the replay"
             self._ledger.event(self._clock.now_ns(), "INFO", text)
 
@@ -154,19 +163,26 @@ class LearnerService:
         now_ns = self._clock.now_ns()
         run_ns = now_ns - spec.t0_ns
         if run_ns < 0:
+            self._on_time = True
             return
         lead_ns = min(max(self._lead_ns, spec.tick_ns), spec.unit_ns)
-        happenings = self._conductor.advance(run_ns, lead_ns)
+        happenings = self._conductor.advance(0, 0) if self._on_time else []
+        self._on_time = False
+        happenings += self._conductor.advance(run_ns, lead_ns)
         while self._orders:
-            order = self._orders.pop(0)
-            obey = self._conductor.pause if order == "hold" else self._conductor.resume
-            happenings += obey(run_ns)
-            self._ledger.event(now_ns, "INFO", f"operator: {order}")
+            happenings += self._obey(self._orders.pop(0), now_ns, run_ns)
         for happening in happenings:
             self._handle(happening, spec)
         if now_ns >= self._metrics_due_ns and self._algorithm is not None:
             self._metrics_due_ns = now_ns + METRICS_PERIOD_NS
             self._ledger_metrics(self._algorithm)
+
+    def _obey(self, order: str, now_ns: int, run_ns: int) -> list[Happening]:
+        self._ledger.event(now_ns, "INFO", f"operator: {order}")
+        if order == "resume":
+            return self._conductor.resume(run_ns)
+        self._ledger.count("operator_holds")
+        return self._conductor.pause(run_ns)
 
     def _handle(self, happening: Happening, spec: Spec) -> None:
         assert self._algorithm is not None
@@ -177,6 +193,8 @@ class LearnerService:
                 self._algorithm.begin_window(window, unit)
             case PhaseEntered():
                 self._announce(happening, spec)
+            case PublishDue(window, iterate) if not self._conductor.improving:  # held in the same turn
+                self._publication.withhold(window.m, iterate, self._clock.now_ns())
             case PublishDue():
                 self._publication.publish(self._algorithm, happening, spec, self._clock, self._windows)
             case PublishMissed(window, iterate):
@@ -197,9 +215,15 @@ class LearnerService:
         )
         self._notices.append(notice)
         self._ledger.windows(self._notices)
+        self._publication.check()
         self.outbox.put(notice)
 
     # ---- small things
+
+    @property
+    def _phase(self) -> Phase:
+        """What is being done now, whoever ordered it."""
+        return "update" if self._conductor.position is None or self._conductor.improving else "hold"
 
     def _over(self, spec: Spec) -> bool:
         """Whether the run has ended: no window begins after the world's end."""
@@ -208,7 +232,7 @@ class LearnerService:
         return over or self._intake.ended
 
     def _at_half_power(self) -> bool:
-        return self._config.learner.hold_learning == "half" and not self._conductor.improving
+        return self._config.learner.hold_learning == "half" and self._phase == "hold"
 
     def _note_duration(self, duration_ns: int) -> None:
         """Keep the publication lead above the time that a step takes (slowly forgotten maximum)."""
@@ -224,9 +248,8 @@ class LearnerService:
         position = self._conductor.position
         if position is None:
             return "no environment yet"
-        phase = "update" if self._conductor.improving else "hold"
         return (
-            f"window {position.window.m}, {phase}, unit {position.unit}, "
+            f"window {position.window.m}, {self._phase}, unit {position.unit}, "
             f"{self._ledger.counter('gradient_steps')} gradient steps, "
             f"policy {self._ledger.counter('last_version')}"
         )

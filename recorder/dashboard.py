@@ -11,7 +11,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorder.scene import ROOT
+from recorder.scene import FOLLOW, ROOT, Camera
 from recorder.telemetry import FORECAST
 from rtcore.messages import Spec
 
@@ -20,18 +20,20 @@ SHOWN_LEVELS = ["INFO", "WARN", "ERROR"]  # DEBUG lines are in the recording, on
 BACKGROUND = [24, 26, 30]
 
 
-def dashboard(spec: Spec, followed: str, *, drift_is_speed: bool, live: bool = False) -> rrb.Blueprint:
+def dashboard(
+    spec: Spec, camera: Camera | None, *, drift_is_speed: bool, live: bool = False
+) -> rrb.Blueprint:
     """The layout.
 
     Args:
         spec: names the environment and its deadline in the titles.
-        followed: entity that the camera follows; empty: no 3-D.
+        camera: of the 3-D view; None: no 3-D.
         drift_is_speed: whether `/env/drift` is a target speed.
         live: follow the end of a running stream instead of showing everything.
     """
     plots = _Plots(live)
     columns: list[Any] = [
-        _left(spec, followed),
+        _left(spec, camera),
         rrb.Vertical(*_middle(plots, drift_is_speed=drift_is_speed), row_shares=[0.8, 2, 2, 2]),
         rrb.Vertical(*_right(plots, spec), row_shares=[2, 0.8, 2, 2]),
     ]
@@ -45,7 +47,7 @@ def dashboard(spec: Spec, followed: str, *, drift_is_speed: bool, live: bool = F
     )
 
 
-def _left(spec: Spec, followed: str) -> Any:
+def _left(spec: Spec, camera: Camera | None) -> Any:
     card = rrb.TextDocumentView(origin="/run_card", name="Run card")
     log = rrb.TextLogView(
         origin="/log",
@@ -53,17 +55,17 @@ def _left(spec: Spec, followed: str) -> Any:
         rows=rrb.TextLogRows(filter_by_log_level=SHOWN_LEVELS),
         columns=rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["LogLevel", "Body"]),
     )
-    if not followed:
+    if camera is None:
         return rrb.Vertical(card, log, row_shares=[1, 1])
-    camera = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital, position=(0, -3.2, 0.9), look_target=(0, 0, 0), tracking_entity=followed
-    )
     world = rrb.Spatial3DView(
-        origin=ROOT,
+        origin=FOLLOW,
+        contents=f"{ROOT}/**",
         name=f"World: {spec.env_id}",
         background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=True, spacing=0.5),
-        eye_controls=camera,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=camera.eye, look_target=camera.target
+        ),
     )
     return rrb.Vertical(world, rrb.Tabs(log, card), row_shares=[3, 2])
 

@@ -16,6 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 TIMEOUT_S = 120.0  # measured: 1.3 s for 23 MB in 15 000 chunks, so an hour at 50 Hz stays below 20 s
+# `python -m rerun_cli` (0.41) ends with 0 whatever happened, and `python -m rerun` imports all of rerun.
+CLI = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
+
+MAGIC = b"RRF2"  # begins every recording
 
 
 class FinishError(RuntimeError):
@@ -28,8 +32,8 @@ def parts_of(recording: Path) -> list[Path]:
 
 
 def set_aside(recording: Path) -> Path | None:
-    """Rename what an earlier incarnation wrote, so that it is not overwritten; None if there is nothing."""
-    if not recording.exists():
+    """Rename what an earlier incarnation wrote, so that it is not overwritten; None if it wrote nothing."""
+    if not recording.exists() or recording.stat().st_size == 0:
         return None
     part = recording.with_name(f"{recording.stem}.part{len(parts_of(recording)):03d}.rrd")
     recording.rename(part)
@@ -48,8 +52,8 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
     parts = parts_of(recording)
     finished = recording.with_name(f".{recording.stem}.finishing.rrd")
     try:
-        sources = [str(path) for path in [*parts, recording] if path.exists()]
-        run_cli(["rrd", "optimize", *sources, "-o", str(finished)], timeout_s=timeout_s)
+        sources = [_checked(path) for path in [*parts, recording]]
+        run_cli(["rrd", "optimize", *map(str, sources), "-o", str(finished)], timeout_s=timeout_s)
         run_cli(["rrd", "verify", str(finished)], timeout_s=timeout_s)
         finished.replace(recording)
     except OSError as error:
@@ -58,6 +62,14 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
         finished.unlink(missing_ok=True)
     for part in parts:
         part.unlink()
+
+
+def _checked(path: Path) -> Path:
+    """Raise FinishError for what is no recording: rerun would take it for an empty one (0.41)."""
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise FinishError(f"{path.name} is no recording")
+    return path
 
 
 def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
@@ -74,7 +86,7 @@ def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
     """
     with tempfile.TemporaryDirectory(prefix="tenuto-") as home:
         switch_off_statistics(Path(home))
-        command = [sys.executable, "-m", "rerun_cli", *arguments]
+        command = [sys.executable, "-c", CLI, *arguments]
         with subprocess.Popen(
             command,
             env={"HOME": home, "NO_COLOR": "1", "RUST_LOG": "warn"},
@@ -98,7 +110,7 @@ def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
 
 
 def switch_off_statistics(home: Path) -> None:
-    """Write below `home` what `rerun analytics disable` would (0.41; it ignores a file that lacks a field)."""
+    """Write below `home` what `rerun analytics disable` would: all fields, or rerun 0.41 ignores it."""
     path = home / ".config" / "rerun" / "analytics.json"
     path.parent.mkdir(parents=True)
     settings = {

@@ -7,6 +7,7 @@ Times come as int64: ns on `run_time` (since T0) and `wall` (Unix), counts on `t
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -48,7 +49,7 @@ def columns(
         with NaN at their end. Both are empty (k = 0) where there is nothing.
 
     Raises:
-        ValueError: the file is torn (end it with `recorder.finish.finish` first).
+        RuntimeError: there is no such file, or it is torn (repair it: `python -m recorder.finish`).
     """
     times, rows = _cells(path, entity, component, timeline)
     flat = [np.ravel(np.array(row, np.float64)) for row in rows]
@@ -78,7 +79,7 @@ def spans(path: str | Path, entity: str = "/learner/phase") -> list[Span]:
 def document(path: str | Path, entity: str = "/run_card") -> str:
     """A static text document as it was written last; empty where there is none."""
     found = ""
-    for chunk in rc.RrdReader(str(path)).stream().filter(content=entity, components=DOCUMENT):
+    for chunk in _chunks(path, content=entity, components=DOCUMENT):
         for row in chunk.to_record_batch().column(DOCUMENT).to_pylist():
             found = "".join(row or ())
     return found
@@ -86,14 +87,13 @@ def document(path: str | Path, entity: str = "/run_card") -> str:
 
 def entities(path: str | Path) -> list[str]:
     """The entities with data, sorted; properties of the recording left out."""
-    stream = rc.RrdReader(str(path)).stream()
-    return sorted({chunk.entity_path for chunk in stream if not chunk.entity_path.startswith("/__")})
+    return sorted({chunk.entity_path for chunk in _chunks(path) if not chunk.entity_path.startswith("/__")})
 
 
 def timelines(path: str | Path, entity: str) -> set[str]:
     """The timelines that every non-static chunk of the entity has."""
     found: set[str] | None = None
-    for chunk in rc.RrdReader(str(path)).stream().filter(content=entity, is_static=False):
+    for chunk in _chunks(path, content=entity, is_static=False):
         names = set(chunk.timeline_names)
         found = names if found is None else found & names
     return found or set()
@@ -103,8 +103,7 @@ def _cells(path: str | Path, entity: str, component: str, timeline: str) -> tupl
     """Times and cells (lists of instances) in order of time."""
     times: list[NDArray[np.int64]] = []
     cells: list[Any] = []
-    stream = rc.RrdReader(str(path)).stream()
-    for chunk in stream.filter(content=entity, has_timeline=timeline, components=component):
+    for chunk in _chunks(path, content=entity, has_timeline=timeline, components=component):
         batch = chunk.to_record_batch()
         times.append(_integers(batch.column(timeline)))
         cells += batch.column(component).to_pylist()
@@ -112,6 +111,13 @@ def _cells(path: str | Path, entity: str, component: str, timeline: str) -> tupl
     order = np.argsort(flat, kind="stable")
     present = [i for i in order.tolist() if cells[i] is not None]  # null: a row of another component
     return flat[present], [cells[i] for i in present]
+
+
+def _chunks(path: str | Path, **wanted: Any) -> list[rc.Chunk]:
+    """All chunks that `wanted` describes. A file that is still written to is read as far as it goes."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RRD file has no footer")
+        return list(rc.RrdReader(str(path)).stream().filter(**wanted))
 
 
 def _integers(column: Any) -> NDArray[np.int64]:

@@ -16,10 +16,14 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from recorder.rows import Floats, Poses
+from recorder.rows import Floats, Poses, Singles
 from rtcore.messages import Spec, Step
 
 ROOT = "/world"
+FOLLOW = f"{ROOT}/follow"  # a frame that goes with the robot and never turns: the 3-D view's own
+GROUND = f"{ROOT}/ground"
+GROUND_X_M, GROUND_Y_M = (-100, 400), 5
+GROUND_COLOUR = [70, 76, 88]
 MAX_HZ = 60.0  # up to here every tick is drawn
 DRAWN_HZ = 50.0
 POINT = f"{ROOT}/point"
@@ -33,10 +37,23 @@ class Shape:
     archetype: rr.AsComponents
 
 
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Where the viewer's eye is and what it looks at, in metres, in the frame `FOLLOW`."""
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+
+
+def camera(size_m: float, height_m: float) -> Camera:
+    """Sees something of `size_m` across from the side, whose middle is `height_m` above the ground."""
+    return Camera((0.15 * size_m, -1.1 * size_m, height_m + 0.25 * size_m), (0.0, 0.0, 0.8 * height_m))
+
+
 class Scene(Protocol):
     """How a kind of world is drawn."""
 
-    followed: str  # entity that the camera follows; empty: none
+    camera: Camera
 
     def shapes(self) -> list[Shape]:
         """Everything that never changes."""
@@ -64,15 +81,28 @@ def positions(steps: Sequence[Step]) -> list[Floats]:
     return [np.frombuffer(step.position, "<f8") for step in steps]
 
 
+def follow(places: Singles) -> Poses:
+    """The frame that goes with something at `places`, float32 [n, 3], on the ground below it."""
+    return Poses(places * np.array([1, 1, 0], np.float32))
+
+
+def ground() -> Shape:
+    """Lines a metre apart on z = 0, for a robot that goes along x: they show how fast it goes."""
+    (begin, end), side = GROUND_X_M, GROUND_Y_M
+    across = [np.array([[x, -side, 0], [x, side, 0]], np.float32) for x in range(begin, end + 1)]
+    along = [np.array([[begin, y, 0], [end, y, 0]], np.float32) for y in range(-side, side + 1)]
+    return Shape(GROUND, rr.LineStrips3D(strips=[*across, *along], colors=[GROUND_COLOUR], radii=[0.004]))
+
+
 class PointScene:
     """A ball that moves along x, or in the plane, or in space: position float64 [1..3] in metres."""
 
-    followed = POINT
+    camera = camera(2.0, 0.0)
 
     def shapes(self) -> list[Shape]:
-        """The ball."""
+        """The ball and the ground."""
         ball = rr.Ellipsoids3D(half_sizes=[[0.15] * 3], colors=[[255, 162, 58]], fill_mode="solid")
-        return [Shape(POINT, ball)]
+        return [Shape(POINT, ball), ground()]
 
     def fits(self, numbers: float) -> bool:
         """One to three coordinates."""
@@ -83,7 +113,7 @@ class PointScene:
         places = np.zeros((len(positions), 3), np.float32)
         for place, position in zip(places, positions, strict=True):
             place[: len(position)] = position[:3]
-        return {POINT: Poses(places)}
+        return {POINT: Poses(places), FOLLOW: follow(places)}
 
 
 class MujocoScene:
@@ -93,7 +123,8 @@ class MujocoScene:
         self._model = model
         self._data = mujoco.MjData(model)
         self._entities = [f"{ROOT}/{self._body_name(body)}" for body in range(model.nbody)]
-        self.followed = self._entities[1] if model.nbody > 1 else ""
+        self._root = min(1, model.nbody - 1)
+        self.camera = self._camera()
 
     @classmethod
     def load(cls, path: Path) -> MujocoScene:
@@ -108,8 +139,8 @@ class MujocoScene:
         return cls(mujoco.MjModel.from_binary_path(str(path)))
 
     def shapes(self) -> list[Shape]:
-        """One entity per geometry, below its body's, in the body's frame."""
-        shapes = []
+        """One entity per geometry, below its body's, in the body's frame; and the ground."""
+        shapes = [ground()]
         for geom in range(self._model.ngeom):
             archetype = self._shape(geom)
             if archetype is not None:
@@ -123,7 +154,7 @@ class MujocoScene:
         return bool(numbers == self._model.nq)
 
     def poses(self, positions: Sequence[Floats]) -> dict[str, Poses]:
-        """World pose of every body but the world itself. 3 us per position for HalfCheetah."""
+        """World pose of every body but the world itself, and of `FOLLOW`. 3 us a position for HalfCheetah."""
         n, bodies = len(positions), self._model.nbody
         places, turns = np.empty((n, bodies, 3), np.float32), np.empty((n, bodies, 4), np.float32)
         for i, position in enumerate(positions):
@@ -131,11 +162,24 @@ class MujocoScene:
             mujoco.mj_kinematics(self._model, self._data)
             places[i], turns[i] = self._data.xpos, self._data.xquat
         turns = _xyzw(turns)
-        return {self._entities[b]: Poses(places[:, b], turns[:, b]) for b in range(1, bodies)}
+        poses = {self._entities[b]: Poses(places[:, b], turns[:, b]) for b in range(1, bodies)}
+        return poses | {FOLLOW: follow(places[:, self._root])}
 
     def _body_name(self, body: int) -> str:
         name = str(self._model.body(body).name)
-        return name if name.replace("_", "").replace("-", "").isalnum() else f"body{body}"
+        plain = name.replace("_", "").replace("-", "").isalnum() and f"{ROOT}/{name}" not in (FOLLOW, GROUND)
+        return name if plain else f"body{body}"
+
+    def _camera(self) -> Camera:
+        """Fits what can be drawn, in the model's first position."""
+        mujoco.mj_kinematics(self._model, self._data)
+        middle = self._data.xpos[self._root]
+        reach = 0.0
+        for geom in range(self._model.ngeom):
+            if self._shape(geom) is not None:
+                far = np.linalg.norm(self._data.geom_xpos[geom] - middle) + self._model.geom_rbound[geom]
+                reach = max(reach, float(far))
+        return camera(2 * reach, max(float(middle[2]), 0.0))
 
     def _shape(self, geom: int) -> rr.AsComponents | None:
         size, place = self._model.geom_size[geom], self._model.geom_pos[geom]

@@ -1,8 +1,7 @@
 """The recorder's loop: take what the others say, and write it down in chunks.
 
 A chunk costs 50-70 us and 2 kB of its own per entity, a row 2 us (measured): so rows wait for each
-other for half a second to a second. `send_columns` hands a chunk to the file at once, so a kill -9 loses at
-most that second.
+other for half a second to a second, which is also what a kill -9 loses at most.
 """
 
 from __future__ import annotations
@@ -97,6 +96,8 @@ class RecorderService:
         self._writer.write(self._steps, self._telemetry, self._intake.placements)
         self._steps = []
         self._oldest_ns = None
+        if not self._recording.sync():
+            self._say("WARN", "the disk does not keep up with the recording")
         live = self._recording.live
         if live is not None and not live.pump() and not self._stall_told:
             self._stall_told = True

@@ -32,6 +32,7 @@ class Look:
     colours: tuple[int, ...]
     drawing: Drawing = "Average"
     width: float = 1.5
+    hidden: tuple[bool, ...] = ()  # until somebody ticks them in the legend; (): none
 
 
 LOOKS: dict[str, Look] = {
@@ -65,6 +66,7 @@ def looks(look: Look) -> list[rr.AsComponents]:
         names=names,
         colors=colours,
         widths=[look.width] * len(names),
+        visible_series=[not hidden for hidden in look.hidden] or None,
         aggregation_policy="Max" if look.drawing == "Max" else "Average",
         interpolation_mode="StepAfter" if look.drawing == "Steps" else "Linear",
     )
@@ -72,8 +74,9 @@ def looks(look: Look) -> list[rr.AsComponents]:
 
 
 def forecast_look(names: Sequence[str]) -> Look:
-    """The forecast's gauges, in the order in which they turned up."""
-    return Look(tuple(names), tuple(PALETTE[i % len(PALETTE)] for i in range(len(names))))
+    """The forecast's gauges, in the order in which they turned up; only the errors share a scale."""
+    colours = tuple(PALETTE[i % len(PALETTE)] for i in range(len(names)))
+    return Look(tuple(names), colours, hidden=tuple(not name.endswith("error") for name in names))
 
 
 def static_looks(*, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:

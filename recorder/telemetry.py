@@ -1,6 +1,6 @@
 """From stats, phases and policies to rows: what the learner did and what everybody said. Pure.
 
-Messages may come twice (retained ones, and phases that stats repeat); each counts once.
+Messages may come twice (retained ones, and what stats repeat); each counts once.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from recorder.rows import Lines, Rows, Scalars, States, Timeline
 from rtcore.channels import LEARNER
-from rtcore.messages import Level, Policy, Stats, WindowNotice
+from rtcore.messages import Event, Level, Policy, Stats, WindowNotice
 
 FORECAST = "/learner/forecast"
 
@@ -26,6 +26,7 @@ class TelemetryRows:
         self._phases: list[tuple[int, str]] = []
         self._versions: list[tuple[int, int]] = []
         self._stats_seen: dict[tuple[str, int], set[int]] = defaultdict(set)
+        self._events_seen: set[tuple[str, Event]] = set()
         self._notices_seen: set[WindowNotice] = set()
         self._versions_seen: set[tuple[int, int]] = set()
         self.forecast_names: list[str] = []  # series of `FORECAST`, in the order of the row; grows
@@ -38,7 +39,9 @@ class TelemetryRows:
         seen.add(stats.seq)
         prefix = f"{stats.process}: "  # some name themselves
         for event in stats.events:
-            self.line(event.at_ns, event.level, f"[{stats.process}] {event.text.removeprefix(prefix)}")
+            if (stats.process, event) not in self._events_seen:
+                self._events_seen.add((stats.process, event))
+                self.line(event.at_ns, event.level, f"[{stats.process}] {event.text.removeprefix(prefix)}")
         for notice in stats.windows:
             self.window(notice)
         if stats.process == LEARNER:

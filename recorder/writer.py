@@ -59,9 +59,9 @@ class RunWriter:
         self._recording.write(rows)
 
     def _introduce(self, *, drift_is_speed: bool) -> None:
-        followed = self._scene.followed if self._scene else ""
+        camera = self._scene.camera if self._scene else None
         self._recording.dashboard(
-            lambda live: dashboard(self._spec, followed, drift_is_speed=drift_is_speed, live=live)
+            lambda live: dashboard(self._spec, camera, drift_is_speed=drift_is_speed, live=live)
         )
         self._recording.start_time(self._spec.wall_t0_ns)
         if self._scene is not None:

@@ -6,11 +6,12 @@ import pytest
 
 from learner.budget import UpdateBudget
 from rtcore.config import LearnerConfig
+from rtcore.messages import Phase
 
 
-def spend_all(budget: UpdateBudget) -> int:
+def spend_all(budget: UpdateBudget, phase: Phase = "update") -> int:
     steps = 0
-    while budget.allows():
+    while budget.allows(phase):
         budget.spend()
         steps += 1
     return steps
@@ -40,3 +41,17 @@ def test_a_hold_earns_its_share_and_leaves_no_debt(share: str, steps: int) -> No
     assert spend_all(budget) == steps
     budget.earn(3, "update")
     assert spend_all(budget) == 3
+
+
+def test_what_a_slow_learner_has_left_is_not_spent_in_a_hold_that_is_off() -> None:
+    budget = UpdateBudget(LearnerConfig(utd=1.0, learning_starts=0, hold_learning="off"))
+    budget.earn(8, "update")
+    assert spend_all(budget, "hold") == 0
+    assert spend_all(budget, "update") == 8
+
+
+def test_a_resumed_learner_does_not_wait_again() -> None:
+    budget = UpdateBudget(LearnerConfig(utd=1.0, learning_starts=10))
+    budget.resume(7)
+    budget.earn(5, "update")
+    assert spend_all(budget) == 2

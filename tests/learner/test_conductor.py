@@ -61,11 +61,23 @@ def test_an_iterate_whose_unit_passed_unseen_is_missed_not_published_in_the_hold
     ]
 
 
-def test_a_stall_reports_every_unit_that_ended() -> None:
+def test_a_stall_over_a_whole_hold_reports_all_that_passed_in_order() -> None:
     conductor = conductor_3_2()
-    conductor.advance(0, LEAD_NS)
-    ended = [h for h in conductor.advance(4100, LEAD_NS) if isinstance(h, UnitEnded)]
-    assert ended == [UnitEnded(0), UnitEnded(1), UnitEnded(2), UnitEnded(3)]
+    window, following = Window(m=0, start=0, update=3, hold=2), Window(m=1, start=5, update=3, hold=2)
+    conductor.advance(900, LEAD_NS)
+    assert conductor.advance(5950, LEAD_NS) == [
+        UnitEnded(0),
+        UnitEnded(1),
+        PublishMissed(window, 2),
+        UnitEnded(2),
+        PublishMissed(window, 3),
+        PhaseEntered(window, "hold", 3000, "schedule"),
+        UnitEnded(3),
+        UnitEnded(4),
+        WindowEntered(following, 5),
+        PhaseEntered(following, "update", 5000, "schedule"),
+        PublishDue(following, 1),
+    ]
 
 
 def test_a_late_start_enters_the_window_that_runs() -> None:
@@ -114,3 +126,12 @@ def test_a_resume_inside_a_scheduled_hold_stays_in_it() -> None:
     conductor.advance(3500, LEAD_NS)
     assert conductor.resume(3600) == []
     assert not improves(conductor)
+
+
+def test_an_operators_hold_that_lasts_into_the_next_window_is_named_in_it() -> None:
+    conductor = conductor_3_2()
+    following = Window(m=1, start=5, update=3, hold=2)
+    conductor.advance(3500, LEAD_NS)
+    assert conductor.pause(3600) == []  # held already
+    assert conductor.advance(5100, LEAD_NS)[-1] == PhaseEntered(following, "hold", 5000, "operator")
+    assert conductor.resume(5200) == [PhaseEntered(following, "update", 5200, "operator")]

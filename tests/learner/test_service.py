@@ -141,7 +141,7 @@ def test_an_operators_hold_withholds_and_resume_publishes_again(run_dir: RunDir)
     rig = Rig(run_dir, replace(CONFIG, learner=always))
     rig.specs.put(SPEC)
     rig.live(0, 12)
-    assert rig.order("hold") == "the policy is held"
+    assert rig.order("hold") == "the policy will be held"
     rig.live(13, 32)
     assert [p.created_ns // TICK_NS for p in rig.published()] == [9]
     assert rig.ledger.counter("withheld") == 2
@@ -161,8 +161,27 @@ def test_a_second_learner_of_the_run_goes_on_from_the_checkpoint(rig: Rig, run_d
     assert second.ledger.counter("learned") == 40  # 20..59; nothing is learned twice, nothing left out
     assert second.ledger.counter("duplicate") == 5
     assert [p.version for p in second.published()] == [3, 4]
+    assert second.ledger.counter("gradient_steps") == 40  # it has data: it does not wait again
     events = [event.text for event in second.ledger.stats(0).events]
     assert "goes on from the checkpoint: policy 2, 19 transitions in the replay" in events
+
+
+def test_versions_rise_even_if_the_learner_before_died_without_a_checkpoint(
+    rig: Rig, run_dir: RunDir
+) -> None:
+    rig.live(0, 19)
+    second = Rig(run_dir)
+    second.specs.put(SPEC)
+    second.live(0, 9)
+    assert [p.version for p in second.published()] == [3]
+
+
+def test_an_order_in_the_turn_of_a_publication_comes_first(rig: Rig) -> None:
+    rig.live(0, 8)
+    rig.order("hold")
+    rig.live(9, 9)  # iterate 1 is due here
+    assert rig.published() == []
+    assert rig.ledger.counter("withheld") == 1
 
 
 def test_a_checkpoint_of_another_network_is_refused(rig: Rig, run_dir: RunDir) -> None:
@@ -179,8 +198,8 @@ def test_after_the_duration_nothing_begins(run_dir: RunDir) -> None:
     rig.specs.put(SPEC)
     rig.live(0, 39)
     done = rig.ledger.counter("gradient_steps")
-    rig.clock.sleep_until_ns(5 * UNIT_NS)
-    rig.learner.catch_up()
+    rig.live(40, 45)  # taken in, but nothing is learned from it any more
+    assert rig.ledger.counter("learned") == 45
     assert rig.ledger.counter("gradient_steps") == done
     assert [n.message.window for n in rig.windows.drain()] == [0, 0]
 

@@ -14,6 +14,7 @@ from recorder.finish import FinishError, run_cli
 from recorder.reading import Span, TimelineName
 from recorder.service import RecorderService
 from rtcore import channels
+from rtcore.lifecycle import Stop
 from rtcore.messages import Event, Step, StepBatch
 from tests.recorder.stage import (
     CONFIG,
@@ -91,9 +92,10 @@ def test_every_entity_is_there_and_every_row_stands_on_all_timelines(told: Stage
         "/env/reward", "/env/return", "/env/drift", "/env/pacing_us",
         "/agent/loop_us", "/agent/reaction_us", "/agent/policy_version", "/agent/missed",
         "/learner/phase", "/learner/published_version", "/learner/loss/critic", "/learner/loss/actor",
-        "/learner/forecast", "/learner/alpha", "/log", "/run_card", "/world/point",
+        "/learner/forecast", "/learner/alpha", "/log", "/run_card",
+        "/world/point", "/world/follow", "/world/ground",
     }  # fmt: skip
-    for entity in set(reading.entities(told.path)) - {"/run_card"}:
+    for entity in set(reading.entities(told.path)) - {"/run_card", "/world/ground"}:
         assert reading.timelines(told.path, entity) == set(TIMELINES), entity
 
 
@@ -207,7 +209,7 @@ def test_the_file_is_compact_verified_and_has_one_dashboard(told: Stage) -> None
 
 
 def test_the_books_are_right(told: Stage) -> None:
-    ticks = 6 * 120 + 120 + (120 - 12) + 12  # six series, the point, versions, returns
+    ticks = 6 * 120 + 2 * 120 + (120 - 12) + 12  # six series, the point and its frame, versions, returns
     others = 2 + 4 + 3 + 4  # publications, phases, lines, gauges
     assert told.ledger.stats(0).counters == {"rows": ticks + others, "dropped": 0, "live_dropped": 0}
 
@@ -386,6 +388,27 @@ def test_who_interrupts_waits_less_for_compaction(
     stage = set_stage(tmp_path, config=replace(CONFIG, duration_s=2.5))
     run(stage, [make_step(seq) for seq in range(ticks)])
     assert given == [patience]
+
+
+@pytest.mark.parametrize(
+    ("last", "final", "waited_s"), [(True, True, 0.0), (True, False, 2.0), (False, True, 2.0)]
+)
+def test_after_the_stop_it_waits_for_last_words_up_to_two_seconds(
+    tmp_path: Path, last: bool, final: bool, waited_s: float
+) -> None:
+    stage = set_stage(tmp_path)
+    stage.spec.put(SPEC)
+    stage.stats(make_stats("learner", 0, T0))
+    stage.stats(make_stats("recorder", 0, T0))  # its own last words cannot be waited for
+    stage.steps([make_step(seq) for seq in range(10)], last=last)
+    if final:
+        stage.stats(make_stats("learner", 1, T0, final=True))
+        stage.service.poll()
+    stop = Stop()
+    stop.set("test")
+    begin_ns = stage.clock.now_ns()
+    stage.service.run(stop)
+    assert stage.clock.now_ns() - begin_ns == pytest.approx(waited_s * 1e9, abs=50 * MS)
 
 
 def test_closing_twice_does_nothing(tmp_path: Path) -> None:

@@ -166,14 +166,23 @@ def test_an_operators_hold_is_a_phase_and_a_line() -> None:
     assert log.index.run_time_ns.tolist() == phase.index.run_time_ns.tolist() == [5, 9]
 
 
-def test_stats_that_come_twice_count_once_but_another_incarnation_counts() -> None:
+def test_stats_and_events_that_come_twice_count_once() -> None:
     telemetry = TelemetryRows()
-    line = Event(at_ns=T0, level="INFO", text="hello")
-    for incarnation in (5, 5, 6):
-        telemetry.stats(make_stats("agent_service", 0, T0, incarnation=incarnation, events=[line]))
-    (log,) = telemetry.rows(Timeline(SPEC))
+    hello, again = (Event(at_ns=T0 + i, level="INFO", text="hello") for i in range(2))
+    gauges = {"alpha": 0.5}
+    for stats in (
+        make_stats("learner", 0, T0, events=[hello], gauges=gauges),
+        make_stats("learner", 0, T0, events=[hello], gauges=gauges),  # the same message
+        make_stats("learner", 1, T0 + 5, events=[hello, again], gauges=gauges),  # one event repeated, one new
+        make_stats("agent_service", 0, T0, events=[hello]),  # the same words from another process
+        make_stats("learner", 0, T0 + 9, incarnation=6, gauges=gauges),  # it came back and counts anew
+    ):
+        telemetry.stats(stats)
+    log, alpha = telemetry.rows(Timeline(SPEC))
     assert isinstance(log.payload, Lines)
-    assert list(log.payload.texts) == ["[agent_service] hello"] * 2
+    assert list(log.payload.texts) == ["[learner] hello", "[learner] hello", "[agent_service] hello"]
+    assert log.index.run_time_ns.tolist() == [0, 1, 0]
+    assert alpha.index.run_time_ns.tolist() == [0, 5, 9]
 
 
 def test_only_the_learners_gauges_are_series() -> None:

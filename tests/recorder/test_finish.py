@@ -1,0 +1,111 @@
+"""A recording survives what happens to its recorder."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from recorder import finish, reading
+from recorder.finish import FinishError, run_cli
+
+CHILD = """
+import sys
+from pathlib import Path
+from tests.recorder.stage import SPEC, make_step, set_stage
+
+stage = set_stage(Path(sys.argv[1]))
+stage.spec.put(SPEC)
+for begin in range(0, 10_000, 50):
+    stage.steps([make_step(seq) for seq in range(begin, begin + 50)], size=50)
+    stage.service.flush()
+    print(begin + 50, flush=True)
+"""
+
+
+def killed(tmp_path: Path, after: int) -> tuple[Path, int]:
+    """The file of a recorder that kill -9 ended in the midst of writing, and the ticks it had written."""
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
+    ) as child:
+        assert child.stdout is not None
+        written = 0
+        while written < after:
+            written = int(child.stdout.readline())
+        os.kill(child.pid, signal.SIGKILL)
+    return tmp_path / "runs" / "r1" / "recording.rrd", written
+
+
+def test_a_killed_recorders_file_is_repaired_and_has_all_that_was_written(tmp_path: Path) -> None:
+    path, written = killed(tmp_path, 300)
+    with pytest.raises(FinishError, match="rrd verify failed"):
+        run_cli(["rrd", "verify", str(path)], timeout_s=10)
+    finish.finish(path)
+    run_cli(["rrd", "verify", str(path)], timeout_s=10)
+    ticks = reading.columns(path, "/env/reward")[0].tolist()
+    assert ticks == list(range(len(ticks)))
+    assert len(ticks) >= written
+
+
+def test_a_torn_file_is_repaired(tmp_path: Path) -> None:
+    path, _ = killed(tmp_path, 100)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(RuntimeError, match="exceeds file size"):
+        reading.columns(path, "/env/reward")
+    assert finish.main([str(path)]) == 0
+    assert len(reading.columns(path, "/env/reward")[0]) >= 50
+
+
+def test_what_is_no_recording_stays_as_it_is(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_text("not a recording")
+    assert finish.main([str(path)]) == 1
+    assert capfd.readouterr().err == "recording.rrd is no recording\n"
+    assert path.read_text() == "not a recording"
+    assert [found.name for found in tmp_path.iterdir()] == ["recording.rrd"]
+    assert finish.main([str(tmp_path / "absent.rrd")]) == 1
+
+
+def test_too_slow_is_a_failure_and_leaves_nothing_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(finish.MAGIC)
+    monkeypatch.setattr(finish, "CLI", "import time; time.sleep(60)")
+    with pytest.raises(FinishError, match=r"rrd optimize took over 0\.5 s"):
+        finish.finish(path, timeout_s=0.5)
+    left = subprocess.run(["pgrep", "-f", str(path)], capture_output=True, text=True, check=False)
+    assert left.stdout == ""
+
+
+def test_parts_are_numbered_and_kept_until_they_are_taken_in(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    assert finish.set_aside(path) is None
+    path.touch()
+    assert finish.set_aside(path) is None
+    names = []
+    for _ in range(2):
+        path.write_text("x")
+        part = finish.set_aside(path)
+        assert part is not None
+        names.append(part.name)
+    assert names == ["recording.part000.rrd", "recording.part001.rrd"]
+    path.write_bytes(finish.MAGIC)
+    with pytest.raises(FinishError, match=r"part000\.rrd is no recording"):
+        finish.finish(path)
+    assert [part.name for part in finish.parts_of(path)] == names
+
+
+def test_usage_statistics_are_off_and_the_users_settings_are_not_touched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    settings = run_cli(["analytics", "config"], timeout_s=10)
+    assert json.loads(settings[settings.index("{") :])["analytics_enabled"] is False
+    assert list(tmp_path.iterdir()) == []
