@@ -11,10 +11,11 @@ from rtcore.process import Process, background, run_process
 
 def serve(process: Process) -> None:
     """Act, then account for what never acted."""
-    service = AgentService(process.config, process.bus, process.clock, process.ledger)
+    last_published = process.run_dir.read_policy()
+    service = AgentService(process.config, process.bus, process.clock, process.ledger, last_published)
     process.bus.serve(channels.AGENT, service.command)
     process.bus.declare_alive(channels.AGENT)
-    with background(service.check_policies, name="policies"):
+    with background(service.check_policies, name="policies", ends=process.stop):
         service.run(process.stop)
     service.close()
 

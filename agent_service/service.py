@@ -12,7 +12,7 @@ from rtcore.clock import Clock
 from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
-from rtcore.messages import Action, Command, CommandReply, Spec, Step
+from rtcore.messages import Action, Command, CommandReply, Policy, Spec, Step
 
 WAIT_S = 0.2  # how long a wait may last before `stop` is looked at
 AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's
@@ -25,9 +25,13 @@ class AgentService:
     driver calls `poll_policies` and `poll` instead.
     """
 
-    def __init__(self, config: RunConfig, bus: Bus, clock: Clock, ledger: Ledger) -> None:
+    def __init__(
+        self, config: RunConfig, bus: Bus, clock: Clock, ledger: Ledger, last_published: Policy | None = None
+    ) -> None:
+        """`last_published` is the run's newest policy so far, for an agent that starts beside no learner."""
         name = config.env.name
         self._clock = clock
+        self._last_published = last_published
         self._ledger = ledger
         self._rng = np.random.default_rng([config.seed, AGENT_STREAM])
         self._specs = bus.latest(channels.SPEC, name)
@@ -133,12 +137,11 @@ class AgentService:
         return self._spec is not None and self._spec.incarnation == step.incarnation
 
     def _meet(self, spec: Spec) -> None:
-        changed = self._spec is None or (
-            (spec.observation_dim, spec.action_low, spec.action_high)
-            != (self._spec.observation_dim, self._spec.action_low, self._spec.action_high)
-        )
-        self._spec = spec
-        if changed:
+        if self._spec is None:  # a later one is the same world in a new incarnation
             low, high = np.asarray(spec.action_low, np.float32), np.asarray(spec.action_high, np.float32)
             self._policy = UniformPolicy(low, high)
-            self._adoption = Adoption(spec, self._ledger)
+            adoption = Adoption(spec, self._ledger)
+            if self._last_published is not None:
+                adoption.offer(self._last_published, self._clock.now_ns())
+            self._adoption = adoption
+        self._spec = spec

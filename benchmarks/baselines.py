@@ -3,7 +3,8 @@
     python -m benchmarks.baselines runs/<run> [runs/<run> ...]
 
 The two policies live through the run's own timetable: the same episodes' lengths at the same units, so
-at the same targets. Only the initial noise of the episodes differs. Returns are per tick.
+at the same targets. Only the initial noise of the episodes differs. Returns are per tick; for worlds
+whose episodes all have the same length.
 """
 
 from __future__ import annotations
@@ -37,15 +38,17 @@ class Arguments:
     out: Path | None = Path("benchmarks/results")
 
 
-def baseline(config: RunConfig, choose: Callable[[World, np.random.Generator], Vector]) -> list[float]:
-    """Returns per tick, one an episode, of a policy that does not look."""
+def baseline(
+    config: RunConfig, choose: Callable[[World, np.random.Generator], Vector], ticks: int
+) -> list[float]:
+    """Returns per tick, one an episode, of a policy that does not look, over so many ticks."""
     env = config.env
     assert env.hz is not None
     rng = np.random.default_rng(BASELINE_SEED)
     world = make_world(env, BASELINE_SEED)
     found: list[float] = []
     total, length, reset = 0.0, 0, True
-    for tick in range(round(config.duration_s * env.hz)):
+    for tick in range(ticks):
         unit = int(tick / env.hz / env.unit_s)
         if reset:
             world.reset(None if tick else BASELINE_SEED, unit)
@@ -82,15 +85,18 @@ def compare(path: Path) -> dict[str, Any]:
     run_dir = RunDir.open(path)
     config = run_dir.config()
     summary = json.loads(run_dir.summary_path.read_text())
+    ticks = summary["ticks"] + summary["deadlines"]["skipped"]
     learned = [value / config.env.episode_steps for value in summary["returns"]]
+    if len(learned) < PARTS:
+        raise SystemExit(f"{path}: {len(learned)} episodes; needs {PARTS}")
     return {
         "run": run_dir.run_name,
         "algo": config.learner.algo,
         "seed": config.seed,
         "duration_s": config.duration_s,
         "learned": parts(learned),
-        "random": parts(baseline(config, uniform)),
-        "still": parts(baseline(config, still)),
+        "random": parts(baseline(config, uniform, ticks)),
+        "still": parts(baseline(config, still, ticks)),
     }
 
 

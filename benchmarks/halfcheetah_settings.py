@@ -22,7 +22,7 @@ from typing import Any
 import tyro
 
 from benchmarks.baselines import baseline, still
-from benchmarks.intervals import half_interval
+from benchmarks.intervals import check_seeds, half_interval
 from env_server.worlds import resolve
 from experiments.presets import halfcheetah
 from launcher.sim import simulate
@@ -75,8 +75,10 @@ def last_half(returns: list[float]) -> float:
 
 def main(arguments: Arguments) -> None:
     """Run everything, print and write the table."""
+    check_seeds(arguments.seeds)
     seeds = range(arguments.seeds)
-    floor = last_half(baseline(configure("preset", 0), still))
+    preset = configure("preset", 0)
+    floor = last_half(baseline(preset, still, round(preset.duration_s * (preset.env.hz or 0.0))))
     found: dict[str, list[float]] = {}
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         pending = {change: [pool.submit(score, change, seed) for seed in seeds] for change in CHANGES}

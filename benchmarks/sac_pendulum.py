@@ -27,7 +27,7 @@ import torch
 import tyro
 from stable_baselines3.common.monitor import Monitor
 
-from benchmarks.intervals import half_interval
+from benchmarks.intervals import check_seeds, half_interval
 from experiments.presets import gym
 from launcher.sim import simulate
 from rtcore.config import RunConfig
@@ -107,6 +107,7 @@ def compare(ours: list[float], theirs: list[float]) -> dict[str, float]:
 
 def main(arguments: Arguments) -> None:
     """Run both on every seed, print the table, write the result."""
+    check_seeds(arguments.seeds)
     seeds = range(arguments.seeds)
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         ours_runs = [pool.submit(tenuto_returns, seed, arguments.steps) for seed in seeds]

@@ -19,7 +19,7 @@ def serve(process: Process) -> None:
         service = EnvService(config, world, bus, process.clock, process.ledger, process.incarnation)
         bus.serve(channels.ENV_SERVER, lambda command: service.command(command, stop))
         bus.declare_alive(channels.ENV_SERVER)
-        with background(service.journal.run, name="journal"):
+        with background(service.journal.run, name="journal", ends=process.stop):
             try:
                 service.run(stop)
             finally:

@@ -24,6 +24,8 @@ from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
+from rtcore.messages import Stats
+from rtcore.process import REPORT_PERIOD_S, Reporter
 from rtcore.run_dir import RunDir
 
 START_NS = 1_000_000_000  # the virtual clock's first instant; any will do
@@ -34,9 +36,11 @@ class Simulation:
 
     def __init__(self, config: RunConfig, run_dir: RunDir, stack: ExitStack) -> None:
         """`stack` closes what is opened here, in reverse order."""
+        self._config = config
         prepare(config.learner.threads)
         self._clock = VirtualClock(START_NS)
         self._hub = MemoryHub()
+        self._buses: dict[str, Bus] = {}
         self.ledgers = {name: Ledger(name, START_NS) for name in channels.PROCESSES}
         clock, ledgers = self._clock, self.ledgers
         world = make_world(config.env, config.seed)
@@ -59,11 +63,17 @@ class Simulation:
             self.recorder = RecorderService(
                 config, run_dir, self._bus(channels.RECORDER, stack), clock, ledgers[channels.RECORDER]
             )
+        self._reporters = {
+            name: Reporter(ledger, self._buses[name], clock, name)
+            for name, ledger in ledgers.items()
+            if name in self._buses
+        }
+        self._report_due_ns = START_NS
 
     def run(self, stop: Stop, progress: Callable[[float], None]) -> None:
         """Run to the end of the configured duration; `progress` hears the run time in seconds."""
         self.env.announce()
-        begin_ns = self._clock.now_ns()
+        hz = self._config.env.hz or 1.0
         for tick in self.env.pacer.ticks(stop):
             self.env.step(tick)
             self.agent.poll_policies()
@@ -72,25 +82,38 @@ class Simulation:
             self.learner.catch_up()  # every tick: publications are due between flushes too
             if flushed:
                 self._record()
-                progress((tick.due_ns - begin_ns) / 1e9)
+                progress(tick.index / hz)
         self.env.close()
         self.learner.catch_up()
         self.learner.close()
         self.agent.poll_policies()
         self.agent.close()
-        self._record()
 
-    def stats(self) -> StatsByProcess:
-        """Every ledger, as the processes would have sent it last."""
-        now_ns = self._clock.now_ns()
-        return {name: [ledger.stats(now_ns, final=True)] for name, ledger in self.ledgers.items()}
+    def finish(self) -> StatsByProcess:
+        """End the recording; returns everybody's last ledger, as the processes would have sent it."""
+        found = {name: [self._last_words(name)] for name in self._reporters if name != channels.RECORDER}
+        if self.recorder is not None:
+            self.recorder.close()
+            found[channels.RECORDER] = [self._last_words(channels.RECORDER)]
+        return found
+
+    def _last_words(self, name: str) -> Stats:
+        last = self._reporters[name].snapshot(final=True)
+        self._reporters[name].publish(last)
+        return last
 
     def _record(self) -> None:
-        if self.recorder is not None:
-            self.recorder.poll()
+        """Let everybody report when it is time, and the recorder take it in."""
+        if self.recorder is None:
+            return
+        if self._clock.now_ns() >= self._report_due_ns:
+            self._report_due_ns = self._clock.now_ns() + round(REPORT_PERIOD_S * 1e9)
+            for reporter in self._reporters.values():
+                reporter.publish(reporter.snapshot())
+        self.recorder.poll()
 
     def _bus(self, name: str, stack: ExitStack) -> Bus:
-        bus = self._hub.bus(name, self._clock)
+        bus = self._buses[name] = self._hub.bus(name, self._clock)
         stack.callback(bus.close)
         return bus
 
@@ -103,7 +126,5 @@ def simulate(
     with ExitStack() as stack:
         simulation = Simulation(config, run_dir, stack)
         simulation.run(stop, progress)
-        if simulation.recorder is not None:
-            simulation.recorder.close()
-        stats = simulation.stats()
+        stats = simulation.finish()
     return stats, time.monotonic() - begin

@@ -120,7 +120,9 @@ def discrepancies(summary: Summary) -> list[str]:
             sum(summary["deadlines"]["missed_by_cause"].values()),
         ),
     ]
-    return [f"{equation}: {left} != {right}" for equation, left, right in pairs if left != right]
+    failing = [f"{equation}: {left} != {right}" for equation, left, right in pairs if left != right]
+    left_over = {"transitions.lost": transitions["lost"], "policies.unreceived": policies["unreceived"]}
+    return failing + [f"{name} >= 0: it is {count}" for name, count in left_over.items() if count < 0]
 
 
 def _deadlines(env: Totals) -> Summary:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -30,7 +31,7 @@ LATEST_SHARE = {channels.ENV_SERVER: 0.0, channels.AGENT: 0.2, channels.LEARNER:
 
 def command_for(process: str, run_dir: Path) -> list[str]:
     """The command line of one process under a supervisor."""
-    return [sys.executable, "-m", process, "--run", str(run_dir), "--supervised"]
+    return [sys.executable, "-m", process, "--run", str(run_dir), "--supervised", str(os.getpid())]
 
 
 @dataclass(frozen=True, slots=True)

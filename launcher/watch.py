@@ -41,6 +41,7 @@ class Watch:
         self._hz = hz
         self._lives: dict[tuple[str, int], _Incarnation] = {}
         self._seen_ns: dict[str, int] = {}
+        self._told_ns: dict[str, int] = {}  # stamp of each process's newest event
         self._recent: dict[str, deque[Stats]] = {}
         self.events: deque[tuple[str, Event]] = deque(maxlen=EVENTS_KEPT)
 
@@ -51,7 +52,7 @@ class Watch:
         if stats.seq >= life.newest.seq:
             life.newest = stats
         life.returns.update({one.episode: one for one in stats.returns})
-        self.events.extend((stats.process, event) for event in stats.events)
+        self.events.extend(self._news(stats))  # they come repeatedly, oldest first
         self._seen_ns[stats.process] = received_ns
         recent = self._recent.setdefault(stats.process, deque())
         if recent and recent[-1].incarnation != stats.incarnation:
@@ -59,6 +60,13 @@ class Watch:
         recent.append(stats)
         while len(recent) > 2 and stats.at_ns - recent[1].at_ns >= RATE_SPAN_NS:
             recent.popleft()
+
+    def _news(self, stats: Stats) -> list[tuple[str, Event]]:
+        told_ns = self._told_ns.get(stats.process, -1)
+        fresh = [(stats.process, event) for event in stats.events if event.at_ns > told_ns]
+        if fresh:
+            self._told_ns[stats.process] = fresh[-1][1].at_ns
+        return fresh
 
     def feed_final(self, stats: Iterable[Stats]) -> None:
         """Take in what the processes wrote at their ends: nothing is missing from it."""

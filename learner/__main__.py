@@ -16,7 +16,7 @@ def serve(process: Process) -> None:
     service = LearnerService(process.config, process.run_dir, process.bus, process.clock, process.ledger)
     process.bus.serve(channels.LEARNER, service.command)
     process.bus.declare_alive(channels.LEARNER)
-    with background(service.outbox.run, name="outbox"):
+    with background(service.outbox.run, name="outbox", ends=process.stop):
         try:
             service.run(process.stop)
         finally:

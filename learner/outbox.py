@@ -10,9 +10,10 @@ from queue import Empty, SimpleQueue
 
 import msgspec
 
-from learner.resume import POLICY_FILE
 from rtcore import channels
 from rtcore.bus import Bus
+from rtcore.clock import Clock
+from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.messages import Policy, WindowNotice
 from rtcore.run_dir import RunDir, write_atomic
@@ -23,11 +24,13 @@ WAIT_S = 0.2
 class Outbox:
     """Policies and window notices on their way out, in order."""
 
-    def __init__(self, bus: Bus, run_dir: RunDir) -> None:
+    def __init__(self, bus: Bus, run_dir: RunDir, clock: Clock, ledger: Ledger) -> None:
+        self._clock = clock
+        self._ledger = ledger
         self._waiting: SimpleQueue[Policy | WindowNotice] = SimpleQueue()
         self._policies = bus.publisher(channels.POLICY)
         self._windows = bus.publisher(channels.WINDOW)
-        self._policy_path = run_dir.learner_dir / POLICY_FILE
+        self._policy_path = run_dir.policy_path
 
     def put(self, message: Policy | WindowNotice) -> None:
         """Take a message; never waits."""
@@ -55,4 +58,8 @@ class Outbox:
             self._windows.put(message)
             return
         self._policies.put(message)
-        write_atomic(self._policy_path, msgspec.msgpack.encode(message))
+        try:
+            write_atomic(self._policy_path, msgspec.msgpack.encode(message))
+        except OSError as error:  # a full disk, say: the policy is on the bus all the same
+            self._ledger.count("policy_file.errors")
+            self._ledger.event(self._clock.now_ns(), "WARN", f"policy {message.version} not on disk: {error}")

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from learner import checkpoint
 from learner.algorithm import Algorithm
 from learner.intake import Intake
-from rtcore.messages import Policy
 from rtcore.run_dir import RunDir
 
 CHECKPOINT_DIR = "checkpoint"  # in the learner's directory, as are the others
 REPLAY_DIR = "replay"
 PLACE = "intake"  # the checkpoint's scalar that says where in the log it was made
-POLICY_FILE = "policy.msgpack"  # the newest published policy, as it went over the bus
 
 
 def save(run_dir: RunDir, algorithm: Algorithm, intake: Intake) -> None:
@@ -41,8 +37,5 @@ def restore(run_dir: RunDir, algorithm: Algorithm, intake: Intake) -> bool:
 
 def last_published(run_dir: RunDir) -> int:
     """Version of the newest policy that was published in this run; 0 if none was."""
-    try:
-        data = (run_dir.learner_dir / POLICY_FILE).read_bytes()
-    except FileNotFoundError:
-        return 0
-    return msgspec.msgpack.decode(data, type=Policy).version
+    policy = run_dir.read_policy()
+    return 0 if policy is None else policy.version

@@ -7,6 +7,7 @@ turn of the loop and never waits; `run` repeats it in a process, `catch_up` in v
 from __future__ import annotations
 
 import time
+from collections import deque
 from typing import assert_never
 
 from learner import resume
@@ -52,7 +53,7 @@ class LearnerService:
         self._ledger = ledger
         self._specs = bus.latest(channels.SPEC, config.env.name)
         self._intake = Intake(bus, config.env.name, ledger)
-        self.outbox = Outbox(bus, run_dir)
+        self.outbox = Outbox(bus, run_dir, clock, ledger)
         self._windows = WindowClock(make_schedule(config.learner.schedule), round(config.env.unit_s * 1e9))
         self._conductor = Conductor(self._windows)
         self._budget = UpdateBudget(config.learner)
@@ -65,6 +66,7 @@ class LearnerService:
         self._lead_ns = LEAD_FLOOR_NS
         self._step_ns = 0
         self._metrics_due_ns = 0
+        self._progress: deque[tuple[int, int]] = deque(maxlen=5)  # (instant, gradient steps), 4 a second
 
     def run(self, stop: Stop) -> None:
         """Learn until stopped, then take what the env server still sends."""
@@ -176,6 +178,7 @@ class LearnerService:
         if now_ns >= self._metrics_due_ns and self._algorithm is not None:
             self._metrics_due_ns = now_ns + METRICS_PERIOD_NS
             self._ledger_metrics(self._algorithm)
+            self._ledger_rate(now_ns)
 
     def _obey(self, order: str, now_ns: int, run_ns: int) -> list[Happening]:
         self._ledger.event(now_ns, "INFO", f"operator: {order}")
@@ -243,6 +246,14 @@ class LearnerService:
         for name, value in algorithm.metrics().items():
             self._ledger.gauge(name, value)
         self._ledger.gauge("replay_size", self._intake.replay_size)
+
+    def _ledger_rate(self, now_ns: int) -> None:
+        """Gradient steps per second over about the last second."""
+        done = self._ledger.counter("gradient_steps")
+        self._progress.append((now_ns, done))
+        begin_ns, begun = self._progress[0]
+        if now_ns > begin_ns:
+            self._ledger.gauge("updates_per_s", (done - begun) * 1e9 / (now_ns - begin_ns))
 
     def _describe(self) -> str:
         position = self._conductor.position

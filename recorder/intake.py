@@ -5,14 +5,13 @@ from __future__ import annotations
 from recorder.telemetry import TelemetryRows
 from rtcore import channels
 from rtcore.bus import Bus
+from rtcore.log_reader import LogReader
 from rtcore.messages import Spec, Stats, Step
-from rtcore.stream import StepStream
 
 LOG_CAPACITY = 2_000  # batches: 100 s of a recorder that hangs, 50 MB at 1 kHz
 STATS_CAPACITY = 2_000
 POLICY_CAPACITY = 64  # a few hundred kB each
 WINDOW_CAPACITY = 2_000
-PATIENCE_NS = 5_000_000_000  # a missing step is waited for so long; the bus recovers one within 2 s
 
 
 class Intake:
@@ -20,20 +19,18 @@ class Intake:
 
     def __init__(self, bus: Bus, env: str, telemetry: TelemetryRows) -> None:
         self._specs = bus.latest(channels.SPEC, env)
-        self._batches = bus.queue(channels.LOG, env, capacity=LOG_CAPACITY)
+        self._log = LogReader(bus, env, capacity_batches=LOG_CAPACITY)
         self._stats = bus.queue(channels.STATS, "*", capacity=STATS_CAPACITY)
         self._notices = bus.queue(channels.WINDOW, capacity=WINDOW_CAPACITY)
         self._policies = bus.queue(channels.POLICY, capacity=POLICY_CAPACITY)
         self._telemetry = telemetry
-        self._stream = StepStream()
-        self._waiting_since_ns: int | None = None  # a step is missing since then
         self._speaking: set[str] = set()  # processes heard whose final stats are still to come
         self.placements: dict[str, str] = {}  # process -> what the system granted it
 
     @property
     def gaps(self) -> int:
         """Steps that never came. A batch lost to a full queue shows here, by its steps."""
-        return self._stream.gaps
+        return self._log.stream.gaps
 
     @property
     def dropped(self) -> int:
@@ -44,11 +41,11 @@ class Intake:
     @property
     def complete(self) -> bool:
         """The env server has ended in order, and everybody heard has sent final stats."""
-        return self._stream.ended and not self._speaking
+        return self._log.ended and not self._speaking
 
     def wait(self, timeout_s: float) -> None:
         """Wait for steps, at most so long."""
-        self._batches.wait(timeout_s)
+        self._log.wait(timeout_s)
 
     def take_spec(self) -> Spec | None:
         """The env server's declaration, if it is new."""
@@ -57,21 +54,11 @@ class Intake:
 
     def take_steps(self, now_ns: int) -> list[Step]:
         """New steps in order, each once; those behind a missing one come when it does, or 5 s later."""
-        steps: list[Step] = []
-        for received in self._batches.drain():
-            steps += self._stream.feed(received.message)
-        if not self._stream.waiting:
-            self._waiting_since_ns = None
-        elif self._waiting_since_ns is None or steps:
-            self._waiting_since_ns = now_ns
-        elif now_ns - self._waiting_since_ns >= PATIENCE_NS:
-            self._waiting_since_ns = now_ns
-            steps += self._stream.give_up()
-        return steps
+        return self._log.read(now_ns)
 
     def give_up_on_gaps(self) -> list[Step]:
         """The steps that still waited for earlier ones; those now count as lost."""
-        return self._stream.flush()
+        return self._log.finish()
 
     def take_telemetry(self) -> int:
         """Pass on stats, phases and policies; returns how many messages there were."""

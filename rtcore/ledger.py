@@ -15,6 +15,7 @@ EVENTS_DROPPED = "events.dropped"
 # are 130 kB, 4096 window notices 160 kB. The final message has all returns and windows.
 MAX_EVENTS = 256
 MAX_TEXT = 500
+REPEAT_NS = 10_000_000_000  # the launcher, the first reader, and the recorder, the last, start 3 s apart
 RECENT_RETURNS = 64
 RECENT_WINDOWS = 4096
 
@@ -30,7 +31,7 @@ class Ledger:
     """One process's books. Thread-safe, except that a histogram has one thread that records in it.
 
     Counters only rise; `stats` is a snapshot of everything since the start, so a lost message loses
-    nothing but its events, and those are in the process's log as well.
+    nothing but, after 10 s, its events, and those are in the process's log as well.
     """
 
     def __init__(self, process: str, incarnation: int) -> None:
@@ -43,6 +44,7 @@ class Ledger:
         self._gauges: dict[str, float] = {}
         self._histograms: dict[str, Histogram] = {}
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self._unsent = 0  # how many of them, the newest, were in no snapshot yet
         self._returns: list[EpisodeReturn] = []
         self._windows: list[WindowNotice] = []
 
@@ -83,8 +85,9 @@ class Ledger:
         """
         self._logger.log(LOG_LEVELS[level], "%s", text)
         with self._lock:
-            if len(self._events) == MAX_EVENTS:
+            if self._unsent == MAX_EVENTS:
                 self._counters[EVENTS_DROPPED] += 1
+            self._unsent = min(self._unsent + 1, MAX_EVENTS)
             self._events.append(Event(at_ns=at_ns, level=level, text=text[:MAX_TEXT]))
 
     def episode(self, episode: EpisodeReturn) -> None:
@@ -98,15 +101,18 @@ class Ledger:
             self._windows = list(windows)
 
     def stats(self, at_ns: int, *, final: bool = False) -> Stats:
-        """Everything so far, plus the events since the previous call.
+        """Everything so far, plus the events since the previous call and those of the last 10 s.
+
+        Events are repeated for readers that came a little later; whoever shows them drops repeats.
 
         Returns and windows: the newest 64 and 4096, so that a reader loses none to a lost message;
         all of them when `final`.
         """
         with self._lock:
             seq, self._seq = self._seq, self._seq + 1
-            events = list(self._events)
-            self._events.clear()
+            while len(self._events) > self._unsent and self._events[0].at_ns < at_ns - REPEAT_NS:
+                self._events.popleft()
+            self._unsent = 0
             return Stats(
                 process=self._process,
                 incarnation=self._incarnation,
@@ -116,7 +122,7 @@ class Ledger:
                 counters=dict(self._counters),
                 gauges=dict(self._gauges),
                 histograms={name: histogram.to_bytes() for name, histogram in self._histograms.items()},
-                events=events,
+                events=list(self._events),
                 returns=self._returns[0 if final else -RECENT_RETURNS :],
                 windows=self._windows[0 if final else -RECENT_WINDOWS :],
             )

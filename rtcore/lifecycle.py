@@ -62,20 +62,25 @@ class Stop:
 
 @contextmanager
 def stop_on_signals(stop: Stop) -> Iterator[None]:
-    """SIGINT and SIGTERM set `stop` inside the block; afterwards the previous handlers are back.
+    """The first SIGINT or SIGTERM inside the block sets `stop`; then the previous handlers are back.
 
-    Main thread only (ValueError elsewhere).
+    So a second one ends the process as if there were no block: an impatient Ctrl-C is a
+    KeyboardInterrupt. Main thread only (ValueError elsewhere).
     """
 
+    def restore() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
     def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signal module's signature
+        restore()
         stop.set(signal.Signals(number).name)
 
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        restore()
 
 
 def die_with_parent(parent_pid: int | None = None) -> bool:

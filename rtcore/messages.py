@@ -170,7 +170,7 @@ class Stats(Message, frozen=True, kw_only=True):
     counters: dict[str, int]
     gauges: dict[str, float]
     histograms: dict[str, bytes]  # see rtcore.histogram
-    events: list[Event] = []  # since the previous message
+    events: list[Event] = []  # of the last 10 s and since the previous message; so they repeat
     returns: list[EpisodeReturn] = []  # the newest ones; repeated, so that a lost message loses none
     windows: list[WindowNotice] = []  # the learner's phases so far
 

@@ -54,20 +54,22 @@ class Reporter:
         self._clock = clock
         self._stats = bus.publisher(channels.STATS, process)
 
-    def report(self, *, final: bool = False) -> Stats:
-        """Publish the ledger as it is, and return what was published."""
+    def snapshot(self, *, final: bool = False) -> Stats:
+        """The ledger as it is."""
         self._ledger.set_counter("messages.rejected", sum(self._bus.rejected().values()))
-        stats = self._ledger.stats(self._clock.now_ns(), final=final)
+        return self._ledger.stats(self._clock.now_ns(), final=final)
+
+    def publish(self, stats: Stats) -> None:
+        """Send a snapshot. One that cannot be sent is counted; the next one has everything in it too."""
         try:
             self._stats.put(stats)
-        except ValueError:  # over the channel's size: the final file has it all the same
-            self._ledger.count("stats.oversize")
-        return stats
+        except (ValueError, BusError):
+            self._ledger.count("stats.unsent")
 
     def run(self, stop: Stop) -> None:
         """Publish until stopped."""
         while not stop.wait(REPORT_PERIOD_S):
-            self.report()
+            self.publish(self.snapshot())
 
 
 def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
@@ -82,7 +84,7 @@ def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--listen", action="append", default=[], metavar="EP", help="further endpoint to offer"
     )
-    parser.add_argument("--supervised", action="store_true", help="end when the parent process ends")
+    parser.add_argument("--supervised", type=int, metavar="PID", help="end when this parent process ends")
     return parser.parse_args(argv)
 
 
@@ -114,8 +116,8 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
         RealtimeError: `agent.rt = "require"` and the system refuses.
     """
     arguments = parse(role, argv)
-    if arguments.supervised:
-        die_with_parent()
+    if arguments.supervised is not None:
+        die_with_parent(arguments.supervised)
     run_dir = RunDir.open(arguments.run)
     config = run_dir.config()
     log_to_file(run_dir.log_path(role), role)
@@ -135,27 +137,37 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
         process = Process(config, run_dir, clock, bus, ledger, stop, incarnation)
         reporter = Reporter(ledger, bus, clock, role)
         try:
-            with background(reporter.run, name="reporter"):
+            with background(reporter.run, name="reporter", ends=stop):
                 yield process
         except Exception as error:
             logging.getLogger(role).exception("%s failed", role)
             ledger.event(clock.now_ns(), "ERROR", f"{role} failed: {error}")
             raise
         finally:
-            run_dir.write_final_stats(reporter.report(final=True))
+            last = reporter.snapshot(final=True)
+            run_dir.write_final_stats(last)
+            reporter.publish(last)
 
 
 @contextmanager
-def background(loop: Callable[[Stop], None], *, name: str) -> Iterator[None]:
+def background(loop: Callable[[Stop], None], *, name: str, ends: Stop) -> Iterator[None]:
     """Run `loop(stop)` on a thread for as long as the block runs, then stop and join it.
 
-    The thread has ordinary scheduling, whatever the process has: it must not delay a tick.
+    The thread has ordinary scheduling, whatever the process has: it must not delay a tick. If it fails,
+    it sets `ends`, the process's own stop, and the block's end raises what it failed with: a process
+    never goes on without one of its threads.
     """
     stop = Stop()
+    failures: list[Exception] = []
 
     def run() -> None:
         realtime.step_back()
-        loop(stop)
+        try:
+            loop(stop)
+        except Exception as error:
+            logging.getLogger(__name__).exception("thread %s failed", name)
+            failures.append(error)
+            ends.set(f"thread {name} failed: {error}")
 
     thread = threading.Thread(target=run, name=name, daemon=True)
     thread.start()
@@ -164,3 +176,5 @@ def background(loop: Callable[[Stop], None], *, name: str) -> Iterator[None]:
     finally:
         stop.set(f"{name} ends")
         thread.join(timeout=JOIN_LIMIT_S)
+    if failures:
+        raise failures[0]

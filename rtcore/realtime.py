@@ -8,6 +8,7 @@ and the agent together, and the learner and the recorder keep off it.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import resource
@@ -126,7 +127,8 @@ def step_back() -> None:
     hash or an encoding of a millisecond would delay a tick by as much.
     """
     if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        with contextlib.suppress(OSError):  # SCHED_IDLE, say, may not be left; it delays no tick either
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def plan(role: str, rt: Rt, allowed: Sequence[int], granted: Privileges) -> Plan:

@@ -18,7 +18,7 @@ from rtcore.channels import PROCESSES
 from rtcore.config import ConfigError, RunConfig
 from rtcore.config_check import check
 from rtcore.config_io import dump_toml, load_toml
-from rtcore.messages import Stats
+from rtcore.messages import Policy, Stats
 
 # The kernel takes 107 bytes for a unix socket's path; 100 leaves room for a longer name than today's.
 SOCKET_PATH_BYTES = 100
@@ -94,6 +94,21 @@ class RunDir:
     def learner_dir(self) -> Path:
         """The learner's own: checkpoints, published policies, replay."""
         return self.path / "learner"
+
+    @property
+    def policy_path(self) -> Path:
+        """`learner/policy.msgpack`: the newest published policy, as it went over the bus."""
+        return self.learner_dir / "policy.msgpack"
+
+    def read_policy(self) -> Policy | None:
+        """The newest published policy; None if none was, or if the file is damaged, which is logged."""
+        try:
+            return msgspec.msgpack.decode(self.policy_path.read_bytes(), type=Policy)
+        except FileNotFoundError:
+            return None
+        except (OSError, msgspec.DecodeError) as error:
+            _LOGGER.warning("%s: %s", self.policy_path, error)
+            return None
 
     @property
     def logs_dir(self) -> Path:

@@ -49,14 +49,13 @@ def policy(version: int, *, mean_bias: float = 0.0, architecture: Architecture =
 class Rig:
     """An agent, and the two ends that it talks to."""
 
-    def __init__(self, hub: MemoryHub, seed: int = 3) -> None:
+    def __init__(self, hub: MemoryHub, seed: int = 3, last_published: Policy | None = None) -> None:
         self.clock = VirtualClock(1_000)
         self.env: Bus = hub.bus(channels.ENV_SERVER, self.clock)
         self.learner: Bus = hub.bus(channels.LEARNER, self.clock)
         self.ledger = Ledger(channels.AGENT, 1)
-        self.agent = AgentService(
-            RunConfig(seed=seed), hub.bus(channels.AGENT, self.clock), self.clock, self.ledger
-        )
+        bus = hub.bus(channels.AGENT, self.clock)
+        self.agent = AgentService(RunConfig(seed=seed), bus, self.clock, self.ledger, last_published)
         self.actions = self.env.queue(channels.ACTION, "env0")
         self.specs = self.env.publisher(channels.SPEC, "env0")
         self.steps = self.env.publisher(channels.STEP, "env0")
@@ -183,3 +182,15 @@ def test_a_restarted_environment_is_answered_once_it_declares_itself(rig: Rig) -
     rig.specs.put(msgspec.structs.replace(SPEC, incarnation=8))
     answer = rig.answer(step(1, incarnation=8))
     assert answer is not None and answer.incarnation == 8
+
+
+def test_beside_no_learner_the_last_published_policy_acts() -> None:
+    rig = Rig(MemoryHub(), last_published=policy(9, mean_bias=0.5))
+    rig.specs.put(SPEC)
+    answer = rig.answer(step(0))
+    assert answer is not None and answer.policy_version == 9
+    rig.policies.put(policy(9, mean_bias=0.5))  # a learner comes, with the same one
+    rig.policies.put(policy(10))
+    answer = rig.answer(step(1))
+    assert answer is not None and answer.policy_version == 10
+    assert rig.ledger.counter("policies.repeated") == 1

@@ -112,6 +112,7 @@ def learner_ledger(*, hold: bool = True) -> Stats:
             "learned": 197,
             "duplicate": 5,
             "gradient_steps": 250,
+            "operator_holds": int(hold),
             "policy_steps": 100,
         },
         gauges={"replay_size": 197.0},

@@ -11,7 +11,7 @@ import pytest
 
 from rtcore import channels
 from rtcore.histogram import Histogram
-from rtcore.ledger import MAX_EVENTS, MAX_TEXT, RECENT_RETURNS, RECENT_WINDOWS, Ledger
+from rtcore.ledger import MAX_EVENTS, MAX_TEXT, RECENT_RETURNS, RECENT_WINDOWS, REPEAT_NS, Ledger
 from rtcore.messages import EpisodeReturn, Stats, WindowNotice
 
 
@@ -82,7 +82,19 @@ def test_a_histogram_is_made_once_and_travels_whole() -> None:
     assert (received.count, received.sum, received.max) == (2, 400, 300)
 
 
-def test_events_are_given_once_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_events_are_repeated_for_ten_seconds_and_given_at_least_once() -> None:
+    ledger = Ledger("agent_service", 1)
+    ledger.event(5, "INFO", "early")
+    assert [event.text for event in ledger.stats(6).events] == ["early"]
+    ledger.event(REPEAT_NS, "INFO", "late")
+    assert [event.text for event in ledger.stats(REPEAT_NS + 5).events] == ["early", "late"]
+    assert [event.text for event in ledger.stats(REPEAT_NS + 6).events] == ["late"]
+    ledger.event(REPEAT_NS, "INFO", "told late")
+    assert [event.text for event in ledger.stats(3 * REPEAT_NS).events] == ["told late"]
+    assert ledger.stats(3 * REPEAT_NS).events == []
+
+
+def test_events_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     ledger = Ledger("agent_service", 1)
     with caplog.at_level(logging.DEBUG):
         ledger.event(5, "WARN", "policy 3 refused: 100% wrong")
@@ -91,7 +103,6 @@ def test_events_are_given_once_and_logged(caplog: pytest.LogCaptureFixture) -> N
         (5, "WARN", "policy 3 refused: 100% wrong"),
         (6, "ERROR", "gone"),
     ]
-    assert ledger.stats(8).events == []
     assert [(record.name, record.levelname, record.getMessage()) for record in caplog.records] == [
         ("agent_service", "WARNING", "policy 3 refused: 100% wrong"),
         ("agent_service", "ERROR", "gone"),

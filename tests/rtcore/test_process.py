@@ -1,0 +1,79 @@
+"""What the processes share: threads that are missed when they die, and last words that are kept."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rtcore import channels
+from rtcore.bus import BusError
+from rtcore.clock import VirtualClock
+from rtcore.config import EnvConfig, RunConfig
+from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop
+from rtcore.memory_bus import MemoryHub
+from rtcore.process import Reporter, background
+from rtcore.run_dir import RunDir
+
+
+def test_a_thread_that_fails_stops_the_process_and_is_raised() -> None:
+    ends = Stop()
+
+    def loop(stop: Stop) -> None:
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"), background(loop, name="outbox", ends=ends):
+        assert ends.wait(5.0)
+    assert ends.reason == "thread outbox failed: disk full"
+
+
+def test_a_thread_that_ends_in_order_raises_nothing() -> None:
+    ends, seen = Stop(), []
+
+    def loop(stop: Stop) -> None:
+        seen.append(stop.wait(5.0))
+
+    with background(loop, name="reporter", ends=ends):
+        pass
+    assert seen == [True]
+    assert not ends.is_set()
+
+
+def test_a_snapshot_that_cannot_be_sent_is_counted_and_whole() -> None:
+    clock = VirtualClock(5)
+    bus = MemoryHub().bus(channels.LEARNER, clock)
+    ledger = Ledger(channels.LEARNER, 1)
+    reporter = Reporter(ledger, bus, clock, channels.LEARNER)
+    ledger.count("learned", 3)
+    bus.close()
+    last = reporter.snapshot(final=True)
+    reporter.publish(last)
+    assert last.counters["learned"] == 3
+    assert ledger.counter("stats.unsent") == 1
+    with pytest.raises(BusError):
+        bus.publisher(channels.WINDOW).put(None)  # type: ignore[arg-type]
+
+
+def test_a_run_directory_that_is_none_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "agent_service", "--run", str(tmp_path)],
+        capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith("agent_service: run_dir = ") and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_whose_parent_is_gone_ends_at_once(tmp_path: Path) -> None:
+    run_dir = RunDir.create(tmp_path / "run", RunConfig(env=EnvConfig(id="pointmass", hz=50.0)))
+    begin = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", "agent_service", "--run", str(run_dir.path), "--supervised", "1"],
+        timeout=30, check=False,
+    )  # fmt: skip
+    assert done.returncode != 0
+    assert time.monotonic() - begin < 20
