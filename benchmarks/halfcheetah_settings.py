@@ -32,14 +32,14 @@ from rtcore.run_dir import RunDir
 
 CHANGES: Mapping[str, Mapping[str, Any]] = {
     "preset": {},
-    "learning rates 1e-3": {"actor_lr": 1e-3, "critic_lr": 1e-3, "alpha_lr": 1e-3},
-    "learning rates 3e-4": {"actor_lr": 3e-4, "critic_lr": 3e-4, "alpha_lr": 3e-4},
-    "gamma 0.99": {"gamma": 0.99},
     "temperature 0.05": {"alpha": 0.05},
     "replay 15 units": {"replay_units": 15.0},
     "replay whole": {"replay_units": None},
     "no hold": {"schedule": ScheduleConfig(l_f=10, gamma_f=1.0)},
     "fsac": {"algo": "fsac"},
+    "gamma 0.97": {"gamma": 0.97},
+    "learning rates 1e-3": {"actor_lr": 1e-3, "critic_lr": 1e-3, "alpha_lr": 1e-3},
+    "learning rates 3e-4": {"actor_lr": 3e-4, "critic_lr": 3e-4, "alpha_lr": 3e-4},
 }
 
 

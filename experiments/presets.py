@@ -23,8 +23,8 @@ def halfcheetah() -> RunConfig:
 
     The target swings between 1 and 3 m/s once in 60 units; episodes are 5 s of simulated time. Two
     minutes are 24 000 ticks, so everything here is chosen to learn from little: small networks, so that
-    one core makes two updates per tick, high learning rates, a short horizon, and a replay of a minute,
-    because older rewards belong to another target. `docs/learning.md` has the measurements.
+    one core makes two updates per tick, high learning rates, and a replay of a minute, because older
+    rewards belong to another target. `docs/learning.md` has the measurements.
     """
     return RunConfig(
         preset="halfcheetah",
@@ -40,7 +40,7 @@ def halfcheetah() -> RunConfig:
             utd=2.0,
             hidden=(128, 128),
             batch=128,
-            gamma=0.97,
+            gamma=0.99,
             tau=0.01,
             actor_lr=3e-3,
             critic_lr=3e-3,
