@@ -34,8 +34,8 @@ class SourceOrder(Generic[T]):
         self._lock = threading.Lock()
         self._sources: dict[str, _Source[T]] = {}
 
-    def live(self, source: str, number: int, item: T) -> tuple[int, int] | None:
-        """Take a live item. A result means: fetch this source's numbers from the first to the second, hand
+    def live(self, source: str, number: int, item: T) -> int | None:
+        """Take a live item. A result means: fetch this source's numbers from the result to `number`, hand
         them to `history`, and call `fetched` when no more will come.
         """
         with self._lock:
@@ -50,7 +50,7 @@ class SourceOrder(Generic[T]):
             elif number > state.next:
                 state.fetching = True
                 state.held[number] = item
-                return state.next, number - 1
+                return state.next
             return None
 
     def history(self, source: str, number: int, item: T) -> None:

@@ -11,7 +11,9 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Generic, Protocol
 
 import zenoh
@@ -24,9 +26,9 @@ from rtcore.clock import Clock
 from rtcore.codec import Codec, check_name, key_for
 from rtcore.commands import CommandClient, CommandServer
 from rtcore.inbox import Bell, Inbox, ThreadBell
+from rtcore.lossless import Fetch, LosslessFeed
 from rtcore.messages import Command, CommandReply
-from rtcore.lossless import LosslessFeed
-from rtcore.zenoh_config import CLIENT, RUNTIME, session_config
+from rtcore.zenoh_config import RUNTIME, session_config
 
 LOSSLESS_CACHE = 2000  # batches a publisher keeps: 100 s at 20 a second
 HEARTBEAT_S = 0.5  # how soon a reader learns that it missed a publisher's last message
@@ -47,8 +49,7 @@ def open_bus(
 ) -> ZenohBus:
     """Join a run. Use it in a `with` block: a process that ends without `close` may hang or abort.
 
-    Returns within half a second, whoever is there; the others are connected to as they come. Zenoh's
-    threads inherit the scheduling of the thread that calls this.
+    Returns within half a second, whoever is there. Zenoh's threads inherit the caller's scheduling.
 
     Args:
         role: one of `channels.PROCESSES`, or "client".
@@ -64,8 +65,8 @@ def open_bus(
     """
     settings = session_config(role, run_name, socket_dir, connect=connect, listen=listen)
     os.putenv("ZENOH_RUNTIME", RUNTIME)  # Zenoh has no other way to set its threads
-    if role != CLIENT:  # errors only and not for commands, because they go to stdout
-        zenoh.init_log_from_env_or("error")
+    # Silent unless RUST_LOG is set, because it writes to stdout.
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # as for close
     try:
         session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
     except zenoh.ZError as error:
@@ -99,6 +100,11 @@ class _ZenohPublisher(Generic[MessageT]):
             raise BusClosedError(str(error)) from error
 
 
+def _on_reply(on_sample: Callable[[zenoh.Sample], None], reply: zenoh.Reply) -> None:
+    if reply.ok is not None:
+        on_sample(reply.ok)
+
+
 def _on_flush(query: zenoh.Query) -> None:
     with query:
         query.reply(FLUSH_KEY, b"")
@@ -114,6 +120,7 @@ class ZenohBus(BaseBus):
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._publishes = False
+        self._wanted: SimpleQueue[Fetch | None] = SimpleQueue()
 
     def publisher(self, channel: Channel[MessageT], name: str = "") -> Publisher[MessageT]:
         """A publisher; see `rtcore.bus.Bus.publisher`."""
@@ -170,7 +177,8 @@ class ZenohBus(BaseBus):
             return frozenset(self._alive)
 
     def join(self) -> None:
-        """Begin to follow who is connected, and let others flush; `open_bus` calls it once."""
+        """Begin to follow who is connected, and serve the needs of lossless channels; once."""
+        threading.Thread(target=self._fetch_missing, name="fetcher", daemon=True).start()
         self._held.append(
             self._session.declare_queryable(FLUSH_KEY, handlers.Callback(_on_flush, indirect=False))
         )
@@ -181,10 +189,11 @@ class ZenohBus(BaseBus):
         )
 
     def close(self) -> None:
-        """Leave the run: in milliseconds, or in about a second where a stopped process must be given up."""
+        """Leave the run: in milliseconds, or in a second or two where stopped processes are given up."""
         first, self._closed = not self._closed, True
         if first and self._publishes:
             self._flush()
+        self._wanted.put(None)
         self._session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub has no return type
 
     def _flush(self) -> None:
@@ -259,7 +268,7 @@ class ZenohBus(BaseBus):
         depth = 1
         if delivery is Delivery.LOSSLESS:
             depth = LOSSLESS_CACHE
-            feed = LosslessFeed(codec, inbox, now_ns, self._fetch)
+            feed = LosslessFeed(codec, inbox, now_ns, self._wanted.put)
             direct = handlers.Callback(feed.on_sample, indirect=False)
         self._held.append(
             ext.declare_advanced_subscriber(
@@ -271,23 +280,20 @@ class ZenohBus(BaseBus):
             )
         )
 
-    def _fetch(
-        self, selector: str, on_sample: Callable[[zenoh.Sample], None], done: Callable[[], None]
-    ) -> None:
-        """Ask a publisher's cache; runs inside Zenoh's callbacks, so it only starts the query."""
-
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                on_sample(reply.ok)
-
-        try:
-            self._session.get(
-                selector,
-                handlers.Callback(on_reply, done, indirect=False),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-                timeout=FETCH_TIMEOUT_S,
-            )
-        except zenoh.ZError:  # the bus closes
-            done()
+    def _fetch_missing(self) -> None:
+        """Ask publishers' caches, on a thread of its own: Zenoh may call back with its routing tables locked,
+        where a query of ours would wait for ever (seen in 1 of 8 links given up).
+        """
+        while (wanted := self._wanted.get()) is not None:
+            time.sleep(wanted.pause_s)
+            try:
+                self._session.get(
+                    wanted.selector,
+                    handlers.Callback(partial(_on_reply, wanted.on_sample), wanted.done, indirect=False),
+                    target=zenoh.QueryTarget.ALL,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    accept_replies=zenoh.ReplyKeyExpr.ANY,
+                    timeout=FETCH_TIMEOUT_S,
+                )
+            except zenoh.ZError:  # the bus closes
+                wanted.done()

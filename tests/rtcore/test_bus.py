@@ -1,31 +1,20 @@
-"""What every bus keeps: the same tests for the in-memory one and for Zenoh."""
+"""What every bus delivers: the same tests for the in-memory one and for Zenoh."""
 
 from __future__ import annotations
 
-import random
-import tempfile
-import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from rtcore import channels
-from rtcore.bus import BusClosedError, NoAnswerError
-from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, STATS, STEP, Channel
-from rtcore.codec import seal
-from rtcore.messages import Command, CommandReply
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, STATS, STEP, Channel
+from rtcore.messages import StepBatch
 from tests.rtcore.bus_samples import (
     ENV,
     SAMPLES,
-    MemoryWorld,
     World,
-    ZenohWorld,
-    action,
     batch,
     collect,
     eventually,
@@ -34,19 +23,6 @@ from tests.rtcore.bus_samples import (
     stats,
     step,
 )
-
-HOLD = Command(id="c1", verb="hold")
-
-
-@pytest.fixture(params=["memory", "zenoh"])
-def world(request: pytest.FixtureRequest) -> Iterator[World]:
-    if request.param == "memory":
-        yield MemoryWorld()
-        return
-    with tempfile.TemporaryDirectory(prefix="tn", dir="/tmp") as directory:
-        zenoh_world = ZenohWorld(Path(directory))
-        yield zenoh_world
-        zenoh_world.close()
 
 
 def test_every_channel_carries_its_message_unchanged(world: World) -> None:
@@ -220,211 +196,13 @@ def test_a_wildcard_hears_every_name_and_a_name_only_its_own(world: World) -> No
     assert {r.message.process for r in one.drain()} == {AGENT}
 
 
-def test_random_bytes_are_counted_and_the_loop_goes_on(world: World) -> None:
-    env, agent = world.bus(ENV_SERVER), world.bus(AGENT)
-    latest, queue = agent.latest(STEP, ENV), agent.queue(STEP, ENV)
-    world.inject(channels.STEP.key_for(ENV), random.Random(1).randbytes(500))
-    assert queue.wait(5.0)
-    assert queue.drain() == []
-    assert latest.wait(0.05) is None
-    assert agent.rejected() == {"step": 2}
-    meet(env, STEP, queue)
-    assert latest.take() is not None
-
-
-def test_a_damaged_message_is_rejected_though_it_decodes(world: World) -> None:
-    agent = world.bus(AGENT)
-    queue = agent.queue(STEP, ENV)
-    first, second = (seal(msgspec.msgpack.encode(step(seq))) for seq in (1, 2))
-    assert len(first) == len(second)
-    world.inject(channels.STEP.key_for(ENV), first[:100] + second[100:])
-    assert queue.wait(5.0)
-    assert queue.drain() == []
-    assert agent.rejected() == {"step": 1}
-
-
-def test_a_bad_message_does_not_end_a_wait(world: World) -> None:
-    env, agent = world.bus(ENV_SERVER), world.bus(AGENT)
-    latest, counter = agent.latest(STEP, ENV), agent.queue(STEP, ENV)
-    meet(env, STEP, counter)
-    latest.take()
-    good = env.publisher(STEP, ENV)
-    result: list[object] = []
-    waiter = threading.Thread(target=lambda: result.append(latest.wait(10.0)))
-    waiter.start()
-    world.inject(channels.STEP.key_for(ENV), b"\xc1")
-    assert eventually(lambda: agent.rejected().get("step", 0) >= 1)
-    good.put(step(9))
-    waiter.join(10.0)
-    assert result and result[0] is not None
-
-
-def test_a_message_of_another_type_is_rejected(world: World) -> None:
-    agent = world.bus(AGENT)
-    queue = agent.queue(STEP, ENV)
-    world.inject(channels.STEP.key_for(ENV), seal(msgspec.msgpack.encode(action())))
-    assert queue.wait(5.0)
-    assert queue.drain() == []
-    assert agent.rejected() == {"step": 1}
-
-
-def test_an_oversized_message_is_refused_by_the_sender(world: World) -> None:
-    publisher = world.bus(AGENT).publisher(ACTION, ENV)
-    with pytest.raises(
-        ValueError, match=r"channel action: a message of 400\d\d bytes: at most 30000 allowed"
-    ):
-        publisher.put(action(values=bytes(40_000)))
-
-
-def test_an_oversized_message_is_dropped_by_the_receiver(world: World) -> None:
-    env = world.bus(ENV_SERVER)
-    latest, queue = env.latest(ACTION, ENV), env.queue(ACTION, ENV)
-    world.inject(channels.ACTION.key_for(ENV), seal(msgspec.msgpack.encode(action(values=bytes(40_000)))))
-    assert eventually(lambda: env.rejected() == {"action": 2})
-    assert latest.take() is None
-    assert queue.drain() == []
-
-
-def test_the_sender_refuses_a_message_of_another_type(world: World) -> None:
-    publisher = world.bus(ENV_SERVER).publisher(STEP, ENV)
-    with pytest.raises(TypeError, match="channel step carries Step, not Action"):
-        publisher.put(action())  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("name", ["", "*", "a/b", "**", "a?b", "a#b"])
-def test_a_publisher_needs_a_plain_name(world: World, name: str) -> None:
-    with pytest.raises(ValueError, match="name = "):
-        world.bus(ENV_SERVER).publisher(STEP, name)
-
-
-def test_a_command_gets_its_reply(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
-    seen: list[str] = []
-
-    def handler(command: Command) -> CommandReply:
-        seen.append(command.verb)
-        return CommandReply(id=command.id, ok=True, text=f"did {command.verb}")
-
-    learner.serve(LEARNER, handler)
-    assert client.ask(LEARNER, HOLD) == CommandReply(id="c1", ok=True, text="did hold")
-    assert seen == ["hold"]
-
-
-def test_a_repeated_command_repeats_the_reply_not_the_deed(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
-    deeds: list[str] = []
-
-    def handler(command: Command) -> CommandReply:
-        deeds.append(command.id)
-        return CommandReply(id="", ok=True, text=f"deed {len(deeds)}")
-
-    learner.serve(LEARNER, handler)
-    first, again = client.ask(LEARNER, HOLD), client.ask(LEARNER, HOLD)
-    assert first == again == CommandReply(id="c1", ok=True, text="deed 1")
-    assert client.ask(LEARNER, Command(id="c2", verb="hold")).text == "deed 2"
-    assert deeds == ["c1", "c2"]
-
-
-def test_a_handler_that_raises_answers_so(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
-
-    def handler(command: Command) -> CommandReply:
-        raise RuntimeError("no window yet")
-
-    learner.serve(LEARNER, handler)
-    assert client.ask(LEARNER, HOLD) == CommandReply(id="c1", ok=False, text="RuntimeError: no window yet")
-
-
-def test_nobody_answers(world: World) -> None:
-    client = world.bus("client")
-    begin = time.monotonic()
-    with pytest.raises(NoAnswerError, match=r"learner did not answer 'hold': 2 tries of up to 0\.2 s"):
-        client.ask(LEARNER, HOLD, timeout_s=0.2, tries=2)
-    assert time.monotonic() - begin < 2.0
-
-
-def test_commands_to_one_process_do_not_reach_another(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
-    learner.serve(LEARNER, lambda command: CommandReply(id=command.id, ok=True, text=""))
-    with pytest.raises(NoAnswerError):
-        client.ask(AGENT, HOLD, timeout_s=0.1, tries=1)
-
-
-def test_everybody_sees_who_is_alive(world: World) -> None:
-    env, agent, learner = world.bus(ENV_SERVER), world.bus(AGENT), world.bus(LEARNER)
-    assert env.alive() == frozenset()
-    for bus, name in ((env, ENV_SERVER), (agent, AGENT), (learner, LEARNER)):
-        bus.declare_alive(name)
-    everybody = frozenset({ENV_SERVER, AGENT, LEARNER})
-    buses = (env, agent, learner, world.bus("client"))
-    assert all(eventually(lambda bus=bus: bus.alive() == everybody) for bus in buses)  # type: ignore[misc]
-    agent.close()
-    survivors = (buses[0], buses[2], buses[3])
-    rest = everybody - {AGENT}
-    assert all(eventually(lambda bus=bus: bus.alive() == rest) for bus in survivors)  # type: ignore[misc]
-    world.bus(AGENT).declare_alive(AGENT)
-    assert all(eventually(lambda bus=bus: bus.alive() == everybody) for bus in survivors)  # type: ignore[misc]
-
-
-def test_a_wait_ends_in_time(world: World) -> None:
-    bus = world.bus(ENV_SERVER)
-    latest, queue = bus.latest(STEP, ENV), bus.queue(STEP, ENV)
-    begin = time.monotonic()
-    assert latest.wait(0.1) is None
-    assert not queue.wait(0.1)
-    assert 0.2 <= time.monotonic() - begin < 1.0
-    assert latest.wait(0.0) is None
-    assert not queue.wait(0.0)
-
-
-def test_a_wait_wakes_at_once(world: World) -> None:
-    env, agent = world.bus(ENV_SERVER), world.bus(AGENT)
-    queue, latest = agent.queue(STEP, ENV), agent.latest(STEP, ENV)
-    meet(env, STEP, queue)
-    latest.take()
-    publisher = env.publisher(STEP, ENV)
-    for reader in (queue, latest):
-        timer = threading.Timer(0.1, publisher.put, (step(1),))
-        timer.start()
-        begin = time.monotonic()
-        assert reader.wait(30.0)
-        assert time.monotonic() - begin < 5.0
-        timer.join()
-        queue.drain()
-
-
-def test_a_closed_bus_says_so(world: World) -> None:
-    bus = world.bus(ENV_SERVER)
-    plain, advanced = bus.publisher(STEP, ENV), bus.publisher(LOG, ENV)
-    begin = time.monotonic()
-    bus.close()
-    bus.close()
-    assert time.monotonic() - begin < 2.0
-    with pytest.raises(BusClosedError):
-        plain.put(step(0))
-    with pytest.raises(BusClosedError):
-        advanced.put(batch(0))
-    for call in (
-        lambda: bus.publisher(STEP, ENV),
-        lambda: bus.latest(STEP, ENV),
-        lambda: bus.queue(STEP, ENV),
-        lambda: bus.ask(LEARNER, HOLD),
-        lambda: bus.serve(ENV, lambda command: CommandReply(id="", ok=True, text="")),
-        lambda: bus.declare_alive(ENV),
-        bus.alive,
-    ):
-        with pytest.raises(BusClosedError):
-            call()
-    assert bus.rejected() == {}
-
-
 def test_what_was_put_before_closing_arrives(world: World) -> None:
     reader = world.bus(RECORDER).queue(LOG, ENV)
     sender = world.bus(ENV_SERVER)
     publisher = sender.publisher(LOG, ENV)
     publisher.put(batch(0))
     collect(reader, until=0)
-    for seq in range(1, 200):
-        publisher.put(batch(seq))
+    for seq in range(1, 100):
+        publisher.put(StepBatch(steps=[step(seq)] * 60))  # 15 kB
     sender.close()
-    assert collect(reader, until=199, patience_s=3.0) == list(range(1, 200))
+    assert collect(reader, until=99, patience_s=3.0)[::60] == list(range(1, 100))
