@@ -73,7 +73,7 @@ def render(summary: Summary, run_dir: RunDir) -> RenderableType:
         Text(),
         _accounts(summary),
         Text(),
-        _files(run_dir),
+        _files(run_dir, "sim" if summary.get("clock") == "virtual" else "run"),
     )
     about = f"{summary['env']}  {summary['algo']}  seed {summary['seed']}"
     return Panel(
@@ -168,12 +168,12 @@ def _accounts(summary: Summary) -> RenderableType:
     return drawing.pairs(rows)
 
 
-def _files(run_dir: RunDir) -> RenderableType:
+def _files(run_dir: RunDir, command: str) -> RenderableType:
     rows: list[tuple[str, Text | str]] = []
     if run_dir.recording_path.exists():
         rows.append(("recording", str(run_dir.recording_path)))
         rows.append(("open it", Text(f"tenuto view {run_dir.path}", style="bold")))
-    rows.append(("run again", Text(f"tenuto run --config {run_dir.config_path}", style="bold")))
+    rows.append(("run again", Text(f"tenuto {command} --config {run_dir.config_path}", style="bold")))
     return drawing.pairs(rows)
 
 

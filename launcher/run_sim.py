@@ -38,6 +38,7 @@ def run_sim(argv: Sequence[str]) -> int:
         wall_s=wall_s,
         restarts={},
         ended="interrupted" if stop.is_set() else "duration",
+        clock="virtual",
     )
     write_summary(run_dir, summary)
     console.print(report.render(summary, run_dir))

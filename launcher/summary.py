@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
-from typing import Any
+from typing import Any, Literal
 
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.config import RunConfig
@@ -58,6 +58,7 @@ def summarise(
     restarts: Mapping[str, int],
     ended: str = "",
     forced: Sequence[str] = (),
+    clock: Literal["wall", "virtual"] = "wall",
 ) -> Summary:
     """The whole summary.
 
@@ -69,6 +70,7 @@ def summarise(
         restarts: how often each process was started again.
         ended: why the run ended, in a few words.
         forced: processes that had to be killed at the end.
+        clock: what the run went by.
     """
     totals = {process: add_up(stats.get(process, ())) for process in PROCESSES}
     env, learner, recorder = totals[ENV_SERVER], totals[LEARNER], totals[RECORDER]
@@ -83,6 +85,7 @@ def summarise(
         "tick_hz": config.env.hz,
         "unit_s": config.env.unit_s,
         "wall_s": wall_s,
+        "clock": clock,
         "ended": ended,
         "forced": list(forced),
         "ticks": ticks,

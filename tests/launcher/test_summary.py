@@ -30,6 +30,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
         "tick_hz": 100.0,
         "unit_s": 1.0,
         "wall_s": 4.5,
+        "clock": "wall",
         "ended": "duration",
         "forced": [],
         "ticks": 200,
