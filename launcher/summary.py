@@ -76,14 +76,7 @@ def summarise(
     env, learner, recorder = totals[ENV_SERVER], totals[LEARNER], totals[RECORDER]
     ticks = env.counters["ticks"]
     return {
-        "schema": SCHEMA,
-        "run": run,
-        "preset": config.preset,
-        "env": config.env.id,
-        "algo": config.learner.algo,
-        "seed": config.seed,
-        "tick_hz": config.env.hz,
-        "unit_s": config.env.unit_s,
+        **_about(config, run),
         "wall_s": wall_s,
         "clock": clock,
         "ended": ended,
@@ -106,6 +99,19 @@ def summarise(
         "recorder": {"rows": recorder.counters["rows"], "dropped": recorder.counters["dropped"]},
         "restarts": {process: restarts.get(process, 0) for process in PROCESSES},
         "messages": {"rejected": sum(total.counters["messages.rejected"] for total in totals.values())},
+    }
+
+
+def _about(config: RunConfig, run: str) -> Summary:
+    return {
+        "schema": SCHEMA,
+        "run": run,
+        "preset": config.preset,
+        "env": config.env.id,
+        "algo": config.learner.algo,
+        "seed": config.seed,
+        "tick_hz": config.env.hz,
+        "unit_s": config.env.unit_s,
     }
 
 

@@ -168,3 +168,10 @@ def set_stage(tmp_path: Path, *, config: RunConfig = CONFIG, **recorder: Any) ->
     bus = hub.bus(channels.RECORDER, clock)
     service = RecorderService(config, run_dir, bus, clock, ledger)
     return Stage(run_dir, config, clock, ledger, service, hub)
+
+
+def run(stage: Stage, steps: list[Step]) -> None:
+    """A whole run: the declaration, `steps`, and the end."""
+    stage.spec.put(SPEC)
+    stage.steps(steps, last=True)
+    stage.service.close()
