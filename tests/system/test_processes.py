@@ -102,8 +102,8 @@ def test_the_summary_reconciles_and_nothing_is_lost(whole_run: Path) -> None:
 def test_the_recording_alone_shows_phases_of_the_configured_lengths(whole_run: Path) -> None:
     phases = spans(whole_run / "recording.rrd")
     assert [phase.state for phase in phases] == ["update", "hold"] * 5
-    # The learner takes note of the first one when it first looks; the others begin on the unit.
     assert [phase.start_ns for phase in phases[1:]] == [2 * UNIT_NS * i for i in range(1, 10)]
+    assert 0 <= phases[0].start_ns < UNIT_NS // 2  # 0, unless a busy machine kept the learner beyond T0
 
 
 def test_the_recording_alone_shows_new_policies_in_update_phases_only(whole_run: Path) -> None:
