@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from rtcore.bus import BusClosedError, LatestReader, QueueReader
+from rtcore.bus import BusClosedError, LatestReader, QueueReader, Received
 from rtcore.channels import Channel, Delivery, MessageT
 from rtcore.clock import Clock
 from rtcore.codec import Codec, Rejections, key_for
-from rtcore.inbox import Bell, Inbox, LatestInbox, QueueInbox
+from rtcore.inbox import Attendant, Bell, Inbox, LatestInbox, QueueInbox
 
 
 class BaseBus(ABC):
@@ -31,6 +32,17 @@ class BaseBus(ABC):
         key = key_for(channel, name, wildcard=True)
         self._subscribe(key, codec, inbox, Delivery.RETAINED if retained else Delivery.REALTIME)
         return inbox
+
+    def attend(
+        self, channel: Channel[MessageT], name: str, answer: Callable[[Received[MessageT]], None]
+    ) -> None:
+        """Answer each message at once; see `rtcore.bus.Bus.attend`."""
+        self.check_open()
+        if channel.delivery is not Delivery.REALTIME:
+            raise ValueError(f"channel {channel.name} is {channel.delivery.value}: only realtime is attended")
+        codec = Codec(channel, self._rejections)
+        key = key_for(channel, name, wildcard=True)
+        self._subscribe(key, codec, Attendant(codec, answer), channel.delivery)
 
     def queue(
         self, channel: Channel[MessageT], name: str = "", *, capacity: int = 10_000

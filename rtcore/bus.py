@@ -84,6 +84,13 @@ class Bus(Protocol):
     def latest(self, channel: Channel[MessageT], name: str = "") -> LatestReader[MessageT]:
         """A reader of the newest message. `name` may be `*`. A RETAINED channel first gives its last."""
 
+    def attend(
+        self, channel: Channel[MessageT], name: str, answer: Callable[[Received[MessageT]], None]
+    ) -> None:
+        """Call `answer` with each message of a REALTIME channel on the thread that receives it, until this
+        bus closes: for what cannot wait until another thread wakes. It must be quick and may `put` on
+        REALTIME channels, but nothing else of the bus; it must not raise."""
+
     def queue(
         self, channel: Channel[MessageT], name: str = "", *, capacity: int = 10_000
     ) -> QueueReader[MessageT]:

@@ -86,6 +86,21 @@ class LatestInbox(Generic[MessageT]):
         return received
 
 
+class Attendant(Generic[MessageT]):
+    """No box at all: each valid message is answered on the thread that received it; see
+    `rtcore.bus.Bus.attend`."""
+
+    def __init__(self, codec: Codec[MessageT], answer: Callable[[Received[MessageT]], None]) -> None:
+        self._codec = codec
+        self._answer = answer
+
+    def offer(self, payload: bytes, received_ns: int) -> None:
+        """Decode and answer."""
+        message = self._codec.decode(payload)
+        if message is not None:
+            self._answer(Received(message, received_ns))
+
+
 class QueueInbox(Generic[MessageT]):
     """Every message in order, up to a capacity; see `rtcore.bus.QueueReader`."""
 

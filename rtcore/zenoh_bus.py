@@ -1,4 +1,4 @@
-"""The bus between processes, over Zenoh. The only file that imports it.
+"""The bus between processes, over Zenoh.
 
 Callbacks run on Zenoh's receiving threads, which carry all topics of a link: they stamp, keep the bytes
 and return.
@@ -6,8 +6,6 @@ and return.
 
 from __future__ import annotations
 
-import json
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -28,13 +26,15 @@ from rtcore.commands import CommandClient, CommandServer
 from rtcore.inbox import Bell, Inbox, ThreadBell
 from rtcore.lossless import Fetch, LosslessFeed
 from rtcore.messages import Command, CommandReply
-from rtcore.zenoh_config import RUNTIME, session_config
+from rtcore.zenoh_config import session_config
+from rtcore.zenoh_session import open_session, realtime_publisher, realtime_subscriber
 
 LOSSLESS_CACHE = 2000  # batches a publisher keeps: 100 s at 20 a second
 HEARTBEAT_S = 0.5  # how soon a reader learns that it missed a publisher's last message
 FETCH_TIMEOUT_S = 5.0  # for the history of a publisher met in mid-stream
 FLUSH_KEY = "flush"  # query, empty reply: all that was sent to this process before has arrived
 FLUSH_S, FLUSH_RETRY_S = 0.5, 0.02
+JOIN_LIMIT_S = 1.0  # it ends within FETCH_PAUSE_S
 RETRY_S = 0.1  # before an unanswered command's second try; the queue of replies may be empty on reconnection
 
 
@@ -64,11 +64,8 @@ def open_bus(
         BusError: Zenoh refuses, as when a process of this role runs already.
     """
     settings = session_config(role, run_name, socket_dir, connect=connect, listen=listen)
-    os.putenv("ZENOH_RUNTIME", RUNTIME)  # Zenoh has no other way to set its threads
-    # Silent unless RUST_LOG is set, because it writes to stdout.
-    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # as for close
     try:
-        session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+        session = open_session(settings)
     except zenoh.ZError as error:
         raise BusError(
             f"{role} cannot join the run in {socket_dir} (does it run already?): {error}"
@@ -121,6 +118,7 @@ class ZenohBus(BaseBus):
         self._alive: set[str] = set()
         self._publishes = False
         self._wanted: SimpleQueue[Fetch | None] = SimpleQueue()
+        self._fetcher = threading.Thread(target=self._fetch_missing, name="fetcher", daemon=True)
 
     def publisher(self, channel: Channel[MessageT], name: str = "") -> Publisher[MessageT]:
         """A publisher; see `rtcore.bus.Bus.publisher`."""
@@ -178,7 +176,7 @@ class ZenohBus(BaseBus):
 
     def join(self) -> None:
         """Begin to follow who is connected, and serve the needs of lossless channels; once."""
-        threading.Thread(target=self._fetch_missing, name="fetcher", daemon=True).start()
+        self._fetcher.start()
         self._held.append(
             self._session.declare_queryable(FLUSH_KEY, handlers.Callback(_on_flush, indirect=False))
         )
@@ -195,6 +193,8 @@ class ZenohBus(BaseBus):
             self._flush()
         self._wanted.put(None)
         self._session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub has no return type
+        # A thread that comes back from Zenoh while the interpreter ends would abort the process.
+        self._fetcher.join(JOIN_LIMIT_S)
 
     def _flush(self) -> None:
         """Wait until everybody has received what was put, as far as they do within FLUSH_S.
@@ -233,9 +233,7 @@ class ZenohBus(BaseBus):
     def _sender(self, key: str, delivery: Delivery) -> _Sender:
         drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
         if delivery is Delivery.REALTIME:
-            return self._session.declare_publisher(
-                key, congestion_control=drop, priority=zenoh.Priority.REAL_TIME, express=True
-            )
+            return realtime_publisher(self._session, key)
         if delivery is Delivery.TELEMETRY:
             return self._session.declare_publisher(key, congestion_control=drop, priority=zenoh.Priority.DATA)
         if delivery is Delivery.LOSSLESS:
@@ -261,11 +259,10 @@ class ZenohBus(BaseBus):
             if fits(len(payload)):
                 offer(payload.to_bytes(), received_ns)
 
-        direct = handlers.Callback(on_sample, indirect=False)
         if delivery in (Delivery.REALTIME, Delivery.TELEMETRY):
-            self._held.append(self._session.declare_subscriber(key, direct))
+            self._held.append(realtime_subscriber(self._session, key, on_sample))
             return
-        depth = 1
+        depth, direct = 1, handlers.Callback(on_sample, indirect=False)
         if delivery is Delivery.LOSSLESS:
             depth = LOSSLESS_CACHE
             feed = LosslessFeed(codec, inbox, now_ns, self._wanted.put)
@@ -284,7 +281,7 @@ class ZenohBus(BaseBus):
         """Ask publishers' caches, on a thread of its own: Zenoh may call back with its routing tables locked,
         where a query of ours would wait for ever (seen in 1 of 8 links given up).
         """
-        while (wanted := self._wanted.get()) is not None:
+        while (wanted := self._wanted.get()) is not None and not self._closed:
             time.sleep(wanted.pause_s)
             try:
                 self._session.get(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from contextlib import closing
 from typing import Any
@@ -9,12 +10,15 @@ from typing import Any
 import pytest
 
 from rtcore import channels
-from rtcore.channels import AGENT, ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, STATS, STEP, Channel
-from rtcore.messages import StepBatch
+from rtcore.bus import Received
+from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, STATS, STEP, Channel
+from rtcore.messages import Step, StepBatch
 from tests.rtcore.bus_samples import (
     ENV,
     SAMPLES,
+    MemoryWorld,
     World,
+    action,
     batch,
     collect,
     eventually,
@@ -64,6 +68,43 @@ def test_latest_gives_the_newest_once(world: World) -> None:
     received = latest.take()
     assert received is not None and received.message == step(50)
     assert latest.take() is None
+
+
+def test_who_attends_answers_on_the_thread_that_receives(world: World) -> None:
+    env, agent = world.bus(ENV_SERVER), world.bus(AGENT)
+    answers = env.queue(ACTION, ENV)
+    publisher = agent.publisher(ACTION, ENV)
+    threads: set[int] = set()
+
+    def answer(received: Received[Step]) -> None:
+        threads.add(threading.get_ident())
+        publisher.put(action(received.message.seq))
+
+    agent.attend(STEP, ENV, answer)
+    steps = env.publisher(STEP, ENV)
+    sent = 0
+    while not answers.wait(0.2):  # the first are lost while the two get to know each other
+        sent += 1
+        steps.put(step(sent))
+    answers.drain()
+    for seq in range(100, 120):
+        steps.put(step(seq))
+        assert answers.wait(5.0)
+        assert [received.message.tick for received in answers.drain()][-1] == seq
+    assert threading.get_ident() not in threads or isinstance(world, MemoryWorld)
+
+
+def test_only_what_cannot_wait_is_attended_and_nothing_bad_is_heard(world: World) -> None:
+    bus = world.bus(AGENT)
+    with pytest.raises(ValueError, match="log is lossless: only realtime is attended"):
+        bus.attend(LOG, ENV, lambda received: None)
+    if isinstance(world, MemoryWorld):
+        heard: list[Step] = []
+        bus.attend(STEP, ENV, lambda received: heard.append(received.message))
+        world.inject(f"env/{ENV}/step", b"nonsense")
+        bus.publisher(STEP, ENV).put(step(3))
+        assert heard == [step(3)]
+        assert bus.rejected() == {"step": 1}
 
 
 def test_queue_keeps_the_order(world: World) -> None:
