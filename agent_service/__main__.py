@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from agent_service.evidence import Evidence
 from agent_service.service import AgentService
 from rtcore import channels
 from rtcore.process import Process, background, run_process
@@ -12,10 +13,13 @@ from rtcore.process import Process, background, run_process
 def serve(process: Process) -> None:
     """Act, then account for what never acted."""
     last_published = process.run_dir.read_policy()
-    service = AgentService(process.config, process.bus, process.clock, process.ledger, last_published)
+    evidence = Evidence(process.clock.now_ns, process.continuations.newest_ns)
+    service = AgentService(
+        process.config, process.bus, process.clock, process.ledger, last_published, evidence
+    )
     process.bus.serve(channels.AGENT, service.command)
     process.bus.declare_alive(channels.AGENT)
-    with background(service.check_policies, name="policies", ends=process.stop):
+    with evidence.gathered(), background(service.check_policies, name="policies", ends=process.stop):
         service.run(process.stop)
     service.close()
 

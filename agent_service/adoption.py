@@ -60,5 +60,5 @@ class Adoption:
             raise WeightsError(f"version {self._newest_version} was there before")
         arrays = verify(policy, self._spec.observation_dim, self._spec.action_dim)
         ready = TanhGaussianPolicy(policy.version, policy.architecture, arrays, self._low, self._high)
-        ready.warm_up(self._spec.observation_dim)
+        ready.warm_up()
         return ready

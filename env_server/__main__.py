@@ -16,7 +16,15 @@ def serve(process: Process) -> None:
     config, bus, stop = process.config, process.bus, process.stop
     with closing(make_world(config.env, config.seed)) as world:
         world.save_scene(process.run_dir.world_path)
-        service = EnvService(config, world, bus, process.clock, process.ledger, process.incarnation)
+        service = EnvService(
+            config,
+            world,
+            bus,
+            process.clock,
+            process.ledger,
+            process.incarnation,
+            resumed_ns=process.continuations.all_ns,
+        )
         bus.serve(channels.ENV_SERVER, lambda command: service.command(command, stop))
         bus.declare_alive(channels.ENV_SERVER)
         with background(service.journal.run, name="journal", ends=process.stop):

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from env_server.rollout import Turn
 from rtcore.ledger import Ledger
-from rtcore.messages import EpisodeReturn
+from rtcore.messages import CAUSES, EpisodeReturn, MissCause
 from rtcore.pacer import Pacer, Tick
 
 COUNTERS = (
-    "ticks", "resets", "produced", "episodes", "missed", "missed.agent_late", "missed.agent_absent",
-    "missed.env_late", "overruns", "skipped", "action.stale", "action.invalid", "action.clipped",
-    "world.broken", "log.dropped", "log.errors",
+    "ticks", "resets", "produced", "episodes", "missed", *(f"missed.{cause}" for cause in CAUSES),
+    "overruns", "skipped", "action.stale", "action.invalid", "action.clipped", "world.broken",
+    "log.dropped", "log.errors",
 )  # fmt: skip
 OVERRUN_EVENT_NS = 1_000_000_000  # at most one line per second about overruns
 
@@ -43,8 +43,8 @@ class Accounts:
         for name in COUNTERS:
             ledger.count(name, 0)  # a counter that stays 0 is reported as well
 
-    def tick(self, tick: Tick, turn: Turn, latency: Latency) -> None:
-        """Enter one executed tick."""
+    def tick(self, tick: Tick, turn: Turn, latency: Latency, *, absent: bool = False) -> None:
+        """Enter one executed tick; `absent`: there is no agent to answer it."""
         count = self._ledger.count
         count("ticks")
         count("resets" if turn.decision is None else "produced")
@@ -58,15 +58,23 @@ class Accounts:
         if turn.decision is not None:
             if turn.decision.clipped:
                 count("action.clipped")
-            if turn.decision.missed:
-                count("missed")
-                count(f"missed.{turn.decision.cause}")
-            self._presence(tick, absent=turn.decision.cause == "agent_absent")
+            self._presence(tick, absent=absent and turn.decision.missed)
         if turn.broken:
             count("world.broken")
             self._ledger.event(tick.woke_ns, "ERROR", f"tick {tick.index}: the world gave NaN or Inf; reset")
         if turn.episode_return is not None:
             self._episode(tick, turn, turn.episode_return)
+
+    def superseded(self, latency: Latency) -> None:
+        """Enter a message that had a newer one right behind it."""
+        self._ledger.count("action.stale")
+        if latency.loop_ns >= 0:
+            self._loop.record(latency.loop_ns)
+
+    def miss(self, cause: MissCause) -> None:
+        """Enter a missed deadline. Only now, with its cause, so that the causes always add up."""
+        self._ledger.count("missed")
+        self._ledger.count(f"missed.{cause}")
 
     def close(self, pacer: Pacer) -> None:
         """Enter the deadlines that were lost after the last executed tick."""

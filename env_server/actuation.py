@@ -7,7 +7,6 @@ without one the tick is a miss and the fallback decides. The decision enters a d
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Literal
@@ -16,11 +15,10 @@ import numpy as np
 
 from env_server.world import Vector, World
 from rtcore.config import EnvConfig, MissPolicy
-from rtcore.messages import Action, Fallback, MissCause
+from rtcore.messages import Action, Fallback
 
 Verdict = Literal["none", "answer", "stale", "invalid"]
 
-_ABSENT_NS = 1_000_000_000  # silent for longer than this, the agent counts as absent rather than late
 _CLIP_TOLERANCE = 1e-6  # of the range: what float32 scaling of [-1, 1] may overshoot without being a fault
 
 
@@ -34,11 +32,10 @@ class Rules:
     observe_actions: int
     low: Vector
     high: Vector
-    tick_ns: int
     incarnation: int
 
     @staticmethod
-    def of(env: EnvConfig, world: World, *, tick_ns: int, incarnation: int) -> Rules:
+    def of(env: EnvConfig, world: World, *, incarnation: int) -> Rules:
         """The rules of one environment."""
         return Rules(
             on_miss=env.on_miss,
@@ -47,7 +44,6 @@ class Rules:
             observe_actions=env.observe_actions,
             low=world.action_low,
             high=world.action_high,
-            tick_ns=tick_ns,
             incarnation=incarnation,
         )
 
@@ -61,7 +57,6 @@ class Decision:
         decided: float32 [action_dim], read-only, enters the delay line; the same as `applied` without delay.
         missed: no answer to the newest observation came.
         fallback: what decided instead of an answer; "" if not missed.
-        cause: of the miss.
         policy_version: behind `decided`; -1 for the neutral action.
         answered_tick: tick of the observation that `decided` answered; -1 for the neutral action.
         verdict: what became of the newest message.
@@ -72,7 +67,6 @@ class Decision:
     decided: Vector
     missed: bool
     fallback: Fallback
-    cause: MissCause
     policy_version: int
     answered_tick: int
     verdict: Verdict
@@ -89,15 +83,13 @@ class _Choice:
 
 
 class Actuation:
-    """Decides tick by tick. Remembers the last decisions of the episode and when the agent was last heard."""
+    """Decides tick by tick. Remembers the last decisions of the episode."""
 
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
         neutral = np.clip(np.zeros_like(rules.low), rules.low, rules.high)
         neutral.setflags(write=False)  # decisions are shared: by hold, delay line and observed actions
         self._neutral = _Choice(neutral, -1, -1)
-        self._absent_ticks = max(1, math.ceil(_ABSENT_NS / rules.tick_ns))
-        self._silent_ticks: int | None = None  # since the last message; None: there was none yet
         self._held: _Choice | None = None
         self._missed_in_a_row = 0
         self._line: deque[Vector] = deque()
@@ -113,28 +105,23 @@ class Actuation:
         Returns:
             "answer" or "none": an answer to the episode's last observation is nobody's fault.
         """
-        self._listen(newest)
         self._start()
         return "none" if newest is None else "answer"
 
-    def decide(self, newest: Action | None, *, expected_tick: int, answer_time_ns: int) -> Decision:
+    def decide(self, newest: Action | None, *, expected_tick: int) -> Decision:
         """The deadline of one tick that is no reset.
 
         Args:
             newest: the newest message that came since the tick before, if any.
             expected_tick: the tick executed before this one, whose observation is to be answered.
-            answer_time_ns: from sending that observation to this wake-up, the time the agent had.
         """
-        self._listen(newest)
         verdict, answer, clipped = self._judge(newest, expected_tick)
         fallback: Fallback = ""
-        cause: MissCause = ""
         if answer is not None:
             self._held, self._missed_in_a_row = answer, 0
             choice = answer
         else:
             fallback, choice = self._fall_back()
-            cause = self._cause(answer_time_ns)
             self._missed_in_a_row += 1
         self._line.append(choice.values)
         if self._past:
@@ -144,7 +131,6 @@ class Actuation:
             decided=choice.values,
             missed=answer is None,
             fallback=fallback,
-            cause=cause,
             policy_version=choice.policy_version,
             answered_tick=choice.answered_tick,
             verdict=verdict,
@@ -166,12 +152,6 @@ class Actuation:
         self._missed_in_a_row = 0
         self._line = deque([neutral] * rules.action_delay_ticks)
         self._past = deque([neutral] * rules.observe_actions, maxlen=rules.observe_actions)
-
-    def _listen(self, newest: Action | None) -> None:
-        if newest is not None:
-            self._silent_ticks = 0
-        elif self._silent_ticks is not None:
-            self._silent_ticks += 1
 
     def _judge(self, newest: Action | None, expected_tick: int) -> tuple[Verdict, _Choice | None, bool]:
         """What the message is, the choice it makes if it is the answer, and whether it had to be clipped."""
@@ -196,10 +176,3 @@ class Actuation:
         if rules.on_miss == "neutral" or run_out or self._held is None:
             return "neutral", self._neutral
         return "hold", self._held
-
-    def _cause(self, answer_time_ns: int) -> MissCause:
-        if self._silent_ticks is None or self._silent_ticks > self._absent_ticks:
-            return "agent_absent"
-        if 2 * answer_time_ns < self._rules.tick_ns:
-            return "env_late"  # the observation left so late that the agent had less than half a period
-        return "agent_late"

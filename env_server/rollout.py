@@ -62,11 +62,11 @@ class Rollout:
         self._ended = True
         self._last_good: Vector = np.zeros(world.observation_dim, np.float32)
 
-    def turn(self, newest: Action | None, t: int, *, expected_tick: int, answer_time_ns: int) -> Turn:
+    def turn(self, newest: Action | None, t: int, *, expected_tick: int) -> Turn:
         """One tick in unit `t`: a reset if the episode has ended, else a step. See `Actuation.decide`."""
         if self._ended:
             return self._reset(newest, t)
-        decision = self._actuation.decide(newest, expected_tick=expected_tick, answer_time_ns=answer_time_ns)
+        decision = self._actuation.decide(newest, expected_tick=expected_tick)
         outcome = self._world.step(decision.applied, t)
         broken = not (np.isfinite(outcome.observation).all() and np.isfinite(outcome.reward))
         if broken:  # it must not reach anybody's replay: the state before again, and a new episode

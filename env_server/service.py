@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from env_server.accounts import Accounts, Latency
 from env_server.actuation import Actuation, Rules
+from env_server.blame import Blame, Miss
 from env_server.journal import Journal
 from env_server.period import tick_ns
-from env_server.rollout import Rollout
+from env_server.rehearsal import Rehearsal
+from env_server.rollout import Rollout, Turn
 from env_server.wording import Stamp, unit_ns, word_spec, word_step
 from env_server.world import World
 from rtcore import channels
@@ -19,13 +22,41 @@ from rtcore.clock import Clock
 from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
-from rtcore.messages import Action, Command, CommandReply
+from rtcore.messages import Action, Command, CommandReply, Step
 from rtcore.pacer import Pacer, Tick
 
 LEAD_NS = 100_000_000  # from announcing T0 to T0, so that the spec is with everybody before step 0
 PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for
 PEERS_POLL_S = 0.05
 REMEMBERED_TICKS = 64  # sending times kept, so that a late answer's latency is known too
+ACTIONS_KEPT = 64  # between two deadlines there is one, unless this process was stalled
+LAST_ANSWER_S = 0.1  # how long the end waits for the answer that tells why the last deadline was missed
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """An observation that was sent: of tick `tick`, whose deadline was `due_ns`, at `sent_ns`."""
+
+    tick: int
+    due_ns: int
+    sent_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An executed tick, for the books.
+
+    Attributes:
+        heard: all that came from the agent since the tick before.
+        asked: the observation that was to be answered; None at the first tick.
+    """
+
+    tick: Tick
+    turn: Turn
+    latency: Latency
+    step: Step
+    heard: Sequence[Received[Action]]
+    asked: Observed | None
 
 
 class EnvService:
@@ -46,8 +77,11 @@ class EnvService:
         incarnation: int,
         *,
         wall_ns: Callable[[], int] = time.time_ns,
+        resumed_ns: Callable[[], Sequence[int]] = tuple,
     ) -> None:
-        """`config.env` is resolved (`worlds.resolve`), `world` is its world, `wall_ns` Unix time."""
+        """`config.env` is resolved (`worlds.resolve`), `world` is its world, `wall_ns` Unix time,
+        `resumed_ns` gives the instants at which this process was continued after a stop.
+        """
         env = config.env
         self._config = config
         self._world = world
@@ -58,14 +92,16 @@ class EnvService:
         self._wall_ns = wall_ns
         self._tick_ns = tick_ns(env)
         self._unit_ns = unit_ns(env)
-        rules = Rules.of(env, world, tick_ns=self._tick_ns, incarnation=incarnation)
+        rules = Rules.of(env, world, incarnation=incarnation)
         self._rollout = Rollout(world, Actuation(rules), episode_steps=env.episode_steps, seed=config.seed)
         self._specs = bus.publisher(channels.SPEC, env.name)
         self._steps = bus.publisher(channels.STEP, env.name)
-        self._actions = bus.latest(channels.ACTION, env.name)
+        self._actions = bus.queue(channels.ACTION, env.name, capacity=ACTIONS_KEPT)
         self.journal = Journal(bus.publisher(channels.LOG, env.name), clock, ledger)
         self._accounts = Accounts(ledger)
-        self._sent: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_TICKS)  # (tick, sent_ns)
+        self._rehearsal = Rehearsal(self._steps, clock, self._tick_ns)
+        self._blame = Blame(self._tick_ns, resumed_ns)
+        self._observed: deque[Observed] = deque(maxlen=REMEMBERED_TICKS)
         self._seq = 0
         self._pacer: Pacer | None = None
         self._t0_ns = 0
@@ -82,8 +118,16 @@ class EnvService:
         if stop.is_set():
             return
         self.announce()
+        rest_s = self._tick_ns / 2e9
         for tick in self.pacer.ticks(stop):
-            self.step(tick)
+            entry = self.act(tick)
+            # The agent has the core until its answer is there; the books can wait.
+            answered = self._actions.wait(rest_s)
+            self.book(entry)
+            if answered and not stop.is_set():
+                self._rehearsal.perform(entry.step)
+        if self._blame.open:
+            self._actions.wait(LAST_ANSWER_S)
 
     def wait_for_peers(self, stop: Stop) -> None:
         """Wait until an agent and a learner are there, `env.start_wait_s` at most."""
@@ -119,25 +163,36 @@ class EnvService:
         self._ledger.event(now_ns, "INFO", f"{env.id} at {1e9 / self._tick_ns:g} Hz{speed}")
 
     def step(self, tick: Tick) -> None:
-        """One deadline. Never waits."""
-        received = self._actions.take()
+        """One deadline, and its books. Never waits."""
+        self.book(self.act(tick))
+
+    def act(self, tick: Tick) -> Entry:
+        """What a deadline cannot wait with: take the newest action, turn the world, publish."""
+        heard = self._listen()
+        newest = heard[-1] if heard else None  # the older ones only tell why they come late
+        asked = self._observed[-1] if self._observed else None
         unit = (tick.due_ns - self._t0_ns) // self._unit_ns
-        last_tick, last_sent_ns = self._sent[-1] if self._sent else (-1, tick.woke_ns)
         turn = self._rollout.turn(
-            None if received is None else received.message,
+            None if newest is None else newest.message,
             unit,
-            expected_tick=last_tick,
-            answer_time_ns=tick.woke_ns - last_sent_ns,
+            expected_tick=-1 if asked is None else asked.tick,
         )
-        latency = self._latency(received)
+        latency = Latency() if newest is None else self._latency(newest)
         position = self._world.position()
         stamp = Stamp(self._config.env.name, self._incarnation, self._seq, unit, self._clock.now_ns())
         step = word_step(stamp, tick, turn, latency, position)
         self._steps.put(step)
-        self.journal.append(step)
-        self._sent.append((tick.index, step.sent_ns))
+        self._observed.append(Observed(tick.index, tick.due_ns, step.sent_ns))
         self._seq += 1
-        self._accounts.tick(tick, turn, latency)
+        return Entry(tick, turn, latency, step, heard, asked)
+
+    def book(self, entry: Entry) -> None:
+        """Enter an executed tick into the ledger, and into the log all steps whose story is complete."""
+        self._hear(entry.heard, entry.step.tick)
+        for received in entry.heard[:-1]:
+            self._accounts.superseded(self._latency(received))
+        self._log(self._blame.enter(entry.step, self._miss(entry)))
+        self._accounts.tick(entry.tick, entry.turn, entry.latency, absent=self._blame.absent)
 
     def command(self, command: Command, stop: Stop) -> CommandReply:
         """Answer an operator; called on the bus's thread."""
@@ -156,15 +211,52 @@ class EnvService:
         """Send what the log still holds, and that nothing follows."""
         if self._pacer is not None:
             self._accounts.close(self._pacer)
+        heard = self._listen()
+        self._hear(heard, self._observed[-1].tick + 1 if self._observed else 0)
+        self._log(self._blame.finish())
         self.journal.close()
 
-    def _latency(self, received: Received[Action] | None) -> Latency:
+    def _listen(self) -> list[Received[Action]]:
+        return [received for received in self._actions.drain() if not received.message.rehearsal]
+
+    def _hear(self, heard: Sequence[Received[Action]], tick: int) -> None:
+        """Take note of what the agent said until tick `tick`."""
+        for received in heard:
+            action = received.message
+            if action.incarnation == self._incarnation and action.tick < tick:
+                observed = self._find(action.tick)
+                self._blame.hear(received, None if observed is None else observed.sent_ns)
+            else:  # of another run, or nonsense
+                self._blame.notice()
+
+    def _log(self, steps: Sequence[Step]) -> None:
+        for step in steps:
+            self.journal.append(step)
+            if step.missed:
+                self._accounts.miss(step.cause)
+
+    @staticmethod
+    def _miss(entry: Entry) -> Miss | None:
+        if not entry.step.missed or entry.asked is None:
+            return None
+        return Miss(
+            entry.asked.tick,
+            due_ns=entry.asked.due_ns,
+            sent_ns=entry.asked.sent_ns,
+            missed_ns=entry.tick.due_ns,
+            woke_ns=entry.tick.woke_ns,
+            over_ns=entry.step.sent_ns,
+            invalid=entry.turn.verdict == "invalid",
+        )
+
+    def _find(self, tick: int) -> Observed | None:
+        return next((observed for observed in reversed(self._observed) if observed.tick == tick), None)
+
+    def _latency(self, received: Received[Action]) -> Latency:
         """Of an answer that came late too: leaving those out would flatter the loop."""
-        if received is None or received.message.incarnation != self._incarnation:
-            return Latency()
         action = received.message
-        for tick, sent_ns in reversed(self._sent):
-            if tick == action.tick:
-                reaction_ns = max(0, action.sent_ns - action.received_ns)
-                return Latency(max(0, received.received_ns - sent_ns), reaction_ns)
-        return Latency()
+        observed = self._find(action.tick) if action.incarnation == self._incarnation else None
+        if observed is None:
+            return Latency()
+        reaction_ns = max(0, action.sent_ns - action.received_ns)
+        return Latency(max(0, received.received_ns - observed.sent_ns), reaction_ns)

@@ -47,7 +47,9 @@ def word_spec(
 
 
 def word_step(stamp: Stamp, tick: Tick, turn: Turn, latency: Latency, position: Position) -> Step:
-    """The report of one executed tick; `latency` is told only when the answer came in time."""
+    """The report of one executed tick, without a miss's cause; `latency` is told only when the answer came
+    in time.
+    """
     if turn.verdict != "answer":
         latency = Latency()
     decision = turn.decision
@@ -72,7 +74,7 @@ def word_step(stamp: Stamp, tick: Tick, turn: Turn, latency: Latency, position: 
         policy_version=-1 if decision is None else decision.policy_version,
         missed=decision is not None and decision.missed,
         fallback="" if decision is None else decision.fallback,
-        cause="" if decision is None else decision.cause,
+        cause="",
         skipped=tick.skipped,
         loop_ns=latency.loop_ns,
         reaction_ns=latency.reaction_ns,

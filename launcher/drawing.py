@@ -70,6 +70,14 @@ def latencies(rows: Mapping[str, Mapping[str, float | None]]) -> Table:
     return table
 
 
+def causes(missed_by_cause: Mapping[str, int], limit: int | None = None) -> Text:
+    """What the misses are due to, the most frequent first and at most `limit`, a line for each two."""
+    ranked = sorted(((n, cause) for cause, n in missed_by_cause.items() if n), reverse=True)[:limit]
+    parts = [f"{n:,} {cause}" for n, cause in ranked]
+    lines = [", ".join(parts[i : i + 2]) for i in range(0, len(parts), 2)]
+    return Text("\n".join(lines), style=LABEL)
+
+
 def misses(missed: int, ratio: float | None) -> Text:
     """The misses, in yellow when they are many."""
     style = "yellow" if ratio is not None and ratio >= MISSES_WORTH_A_LOOK else ""

@@ -90,11 +90,11 @@ def render(summary: Summary, run_dir: RunDir) -> RenderableType:
 
 def _real_time(summary: Summary) -> RenderableType:
     deadlines = summary["deadlines"]
-    causes = ", ".join(f"{n} {cause}" for cause, n in deadlines["missed_by_cause"].items() if n)
+    causes = drawing.causes(deadlines["missed_by_cause"])
     rows: list[tuple[str, Text | str]] = [
         ("ticks", f"{summary['ticks']:,} at {drawing.number(summary['tick_hz'], 1)} Hz"),
         ("missed", drawing.misses(deadlines["missed"], deadlines["miss_ratio"])),
-        *([("", Text(causes, style=LABEL))] if causes else []),
+        *([("", causes)] if causes else []),
         ("overruns", f"{deadlines['overruns']:,}"),
     ]
     times = drawing.latencies(

@@ -24,6 +24,7 @@ from launcher.watch import RETURNS_SHOWN, Watch
 from rtcore import channels
 from rtcore.clock import Clock
 from rtcore.config import RunConfig
+from rtcore.messages import CAUSES
 
 REFRESH_NS = 250_000_000
 LINE_NS = 5_000_000_000
@@ -188,11 +189,13 @@ class Screen:
 
     def _deadlines(self, now: Now) -> RenderableType:
         ticks, missed = now.env.counters["ticks"], now.env.counters["missed"]
+        by_cause: dict[str, int] = {cause: now.env.counters[f"missed.{cause}"] for cause in CAUSES}
         held = drawing.number(self._watch.rate(channels.ENV_SERVER, "ticks"), 1)
         facts = drawing.pairs(
             [
                 ("rate held", f"{held} of {drawing.number(self._config.env.hz, 1)} Hz"),
                 ("missed", drawing.misses(missed, missed / ticks if ticks else None)),
+                ("", drawing.causes(by_cause, limit=2)),
             ]
         )
         times = drawing.latencies(

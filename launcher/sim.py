@@ -73,11 +73,11 @@ class Simulation:
     def run(self, stop: Stop, progress: Callable[[float], None]) -> None:
         """Run to the end of the configured duration; `progress` hears the run time in seconds."""
         self.env.announce()
+        self.agent.attend()
         hz = self._config.env.hz or 1.0
         for tick in self.env.pacer.ticks(stop):
-            self.env.step(tick)
             self.agent.poll_policies()
-            self.agent.poll()
+            self.env.step(tick)  # the agent answers within it
             flushed = self.env.journal.flush_due(self._clock.now_ns())
             self.learner.catch_up()  # every tick: publications are due between flushes too
             if flushed:

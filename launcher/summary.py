@@ -11,11 +11,10 @@ from typing import Any, Literal
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.config import RunConfig
 from rtcore.histogram import Histogram
-from rtcore.messages import Stats, WindowNotice
+from rtcore.messages import CAUSES, Stats, WindowNotice
 
 SCHEMA = 1
 FATES = ("adopted", "rejected", "superseded", "unused", "unreceived")  # of a published policy
-CAUSES = ("agent_late", "agent_absent", "env_late")
 
 Summary = dict[str, Any]
 StatsByProcess = Mapping[str, Sequence[Stats]]  # per process: the newest ledger of each incarnation
@@ -192,6 +191,16 @@ def _learner(learner: Totals, run_time_s: float) -> Summary:
         "gradient_steps": steps,
         "policy_steps": learner.counters["policy_steps"],
         "updates_per_s": steps / run_time_s if run_time_s else None,
+        "governor": _governor(learner),
+    }
+
+
+def _governor(learner: Totals) -> Summary:
+    """`limited_share`: of the time that was governed, with less than full power; None without a governor."""
+    ticks, limited = learner.counters["governor.ticks"], learner.counters["governor.limited_ticks"]
+    return {
+        "decisions": learner.counters["governor.decisions"],
+        "limited_share": limited / ticks if ticks else None,
     }
 
 

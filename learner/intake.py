@@ -61,9 +61,12 @@ class Intake:
         """Wait until something has come, at most so long."""
         self._log.wait(timeout_s)
 
-    def take(self, now_ns: int) -> int:
-        """Move all that has come into the replay; returns the number of new transitions."""
-        return 0 if self._replay is None else self._learn(self._replay, self._log.read(now_ns))
+    def take(self, now_ns: int) -> tuple[int, list[Step]]:
+        """Move all that has come into the replay; returns the number of new transitions, and the steps."""
+        if self._replay is None:
+            return 0, []
+        steps = self._log.read(now_ns)
+        return self._learn(self._replay, steps), steps
 
     def finish(self) -> None:
         """Nothing follows: give up on gaps, take what waited behind them, and put the replay on disk."""

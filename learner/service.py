@@ -24,6 +24,7 @@ from learner.conductor import (
 )
 from learner.intake import Intake
 from learner.outbox import Outbox
+from learner.power import Levers, PowerControl
 from learner.publication import Publication
 from learner.replay import open_replay
 from rtcore import channels
@@ -46,7 +47,17 @@ LEARNER_STREAM = 2  # keeps the learner's random numbers apart from the world's 
 class LearnerService:
     """Trains on the log of one environment."""
 
-    def __init__(self, config: RunConfig, run_dir: RunDir, bus: Bus, clock: Clock, ledger: Ledger) -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        run_dir: RunDir,
+        bus: Bus,
+        clock: Clock,
+        ledger: Ledger,
+        *,
+        levers: Levers | None = None,
+    ) -> None:
+        """`levers`: for the governor; None, as in virtual time: it does not govern."""
         self._config = config
         self._run_dir = run_dir
         self._clock = clock
@@ -57,6 +68,7 @@ class LearnerService:
         self._windows = WindowClock(make_schedule(config.learner.schedule), round(config.env.unit_s * 1e9))
         self._conductor = Conductor(self._windows)
         self._budget = UpdateBudget(config.learner)
+        self._power = PowerControl(config.learner, levers, ledger)
         self._notices: list[WindowNotice] = []
         self._publication = Publication(config.learner.algo, self._notices, self.outbox, ledger)
         self._orders: list[str] = []  # from the bus's thread; carried out between two steps
@@ -64,7 +76,6 @@ class LearnerService:
         self._on_time = False  # the learner was there before T0: the first window begins on the dot
         self._algorithm: Algorithm | None = None
         self._lead_ns = LEAD_FLOOR_NS
-        self._step_ns = 0
         self._metrics_due_ns = 0
         self._progress: deque[tuple[int, int]] = deque(maxlen=5)  # (instant, gradient steps), 4 a second
 
@@ -75,9 +86,8 @@ class LearnerService:
                 stop.wait(IDLE_WAIT_S)  # the log may be there already, and would not let us wait
                 self.step()
             elif not self.step():
-                self._intake.wait(IDLE_WAIT_S)
-            elif self._at_half_power():
-                stop.wait(self._step_ns / 1e9)
+                pause_s = self._power.pause_s(self._clock.now_ns())
+                self._intake.wait(min(pause_s or IDLE_WAIT_S, IDLE_WAIT_S))
         deadline = time.monotonic() + DRAIN_LIMIT_S
         while self._spec is not None and not self._intake.ended and time.monotonic() < deadline:
             self._intake.wait(IDLE_WAIT_S)
@@ -91,6 +101,7 @@ class LearnerService:
 
     def step(self) -> bool:
         """Take in, keep the schedule, make at most one gradient step. Says whether it made one."""
+        begin_ns = self._clock.now_ns()
         self._take_in()
         if self._spec is None or self._algorithm is None:
             return False
@@ -98,17 +109,10 @@ class LearnerService:
             self._keep_schedule(self._spec)
         elif not self._intake.ended:
             return False  # what still comes is taken in; nothing is learned after the end
-        if not self._budget.allows(self._phase):
+        if self._power.pause_s(self._clock.now_ns()) > 0 or not self._budget.allows(self._phase):
             return False
-        begin_ns = self._clock.now_ns()
-        improve = self._phase == "update"
-        self._algorithm.update(improve_policy=improve)
-        self._budget.spend()
-        self._publication.improved |= improve
-        self._ledger.count("gradient_steps")
-        if improve:
-            self._ledger.count("policy_steps")
-        self._note_duration(self._clock.now_ns() - begin_ns)
+        self._improve(self._algorithm)
+        self._power.worked(begin_ns, self._clock.now_ns(), self._phase)
         return True
 
     def command(self, command: Command) -> CommandReply:
@@ -137,9 +141,23 @@ class LearnerService:
             self._meet(declared.message)
         if self._spec is None:
             return
-        learned = self._intake.take(self._clock.now_ns())
+        now_ns = self._clock.now_ns()
+        learned, steps = self._intake.take(now_ns)
         if learned:
             self._budget.earn(learned, self._phase)
+        self._power.watch(steps, now_ns)
+
+    def _improve(self, algorithm: Algorithm) -> None:
+        """One gradient step."""
+        begin_ns = self._clock.now_ns()
+        improve = self._phase == "update"
+        algorithm.update(improve_policy=improve)
+        self._budget.spend()
+        self._publication.improved |= improve
+        self._ledger.count("gradient_steps")
+        if improve:
+            self._ledger.count("policy_steps")
+        self._note_duration(self._clock.now_ns() - begin_ns)
 
     def _meet(self, spec: Spec) -> None:
         if self._spec is not None:
@@ -149,6 +167,7 @@ class LearnerService:
             return
         self._spec = spec
         learner = self._config.learner
+        self._power.meet(spec.tick_ns, self._clock.now_ns())
         directory = self._run_dir.learner_dir / resume.REPLAY_DIR
         replay = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
         self._intake.meet(spec, replay)
@@ -234,18 +253,15 @@ class LearnerService:
         over = 0 < duration_ns <= self._clock.now_ns() - spec.t0_ns
         return over or self._intake.ended
 
-    def _at_half_power(self) -> bool:
-        return self._config.learner.hold_learning == "half" and self._phase == "hold"
-
     def _note_duration(self, duration_ns: int) -> None:
         """Keep the publication lead above the time that a step takes (slowly forgotten maximum)."""
-        self._step_ns = duration_ns
         self._lead_ns = max(LEAD_FLOOR_NS, 2 * duration_ns, round(0.99 * self._lead_ns))
 
     def _ledger_metrics(self, algorithm: Algorithm) -> None:
         for name, value in algorithm.metrics().items():
             self._ledger.gauge(name, value)
         self._ledger.gauge("replay_size", self._intake.replay_size)
+        self._power.report()
 
     def _ledger_rate(self, now_ns: int) -> None:
         """Gradient steps per second over about the last second."""

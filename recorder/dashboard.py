@@ -13,7 +13,8 @@ import rerun.blueprint as rrb
 
 from recorder.scene import FOLLOW, ROOT, Camera
 from recorder.telemetry import FORECAST
-from rtcore.messages import Spec
+from recorder.ticks import MISSED
+from rtcore.messages import CAUSES, Spec
 
 LIVE_WINDOW_S = 30.0
 SHOWN_LEVELS = ["INFO", "WARN", "ERROR"]  # DEBUG lines are in the recording, one click away
@@ -85,7 +86,7 @@ def _right(plots: _Plots, spec: Spec) -> list[Any]:
     latency = f"Latency, µs (deadline {spec.tick_ns / 1e3:,.0f})"
     return [
         plots.lines(latency, "/agent/loop_us", "/agent/reaction_us", "/env/pacing_us", legend=True),
-        plots.lines("Missed deadlines", "/agent/missed"),
+        plots.lines("Missed deadlines", MISSED, *(f"{MISSED}/{cause}" for cause in CAUSES), legend=True),
         plots.lines("Policy version", "/learner/published_version", "/agent/policy_version", legend=True),
         rrb.Tabs(
             plots.lines("Losses", "/learner/loss/**", legend=True),

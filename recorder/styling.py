@@ -10,9 +10,11 @@ import numpy as np
 import rerun as rr
 
 from recorder.telemetry import FORECAST
+from recorder.ticks import MISSED
+from rtcore.messages import CAUSES
 
 BLUE, ORANGE, GREEN = 0x4E9BFFFF, 0xFFA23AFF, 0x3ECF8EFF
-RED, PURPLE, GREY = 0xFF5A5FFF, 0xB18CFFFF, 0x9AA4B2FF
+RED, PURPLE, GREY, YELLOW = 0xFF5A5FFF, 0xB18CFFFF, 0x9AA4B2FF, 0xFFE066FF
 DOT_SIZE = 3.0
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
 
@@ -41,7 +43,11 @@ LOOKS: dict[str, Look] = {
     "/env/pacing_us": Look(("pacing error",), (GREY,), "Max"),
     "/agent/loop_us": Look(("loop",), (ORANGE,), "Max"),
     "/agent/reaction_us": Look(("agent's reaction",), (BLUE,), "Max"),
-    "/agent/missed": Look(("missed",), (RED,), "Max"),
+    MISSED: Look(("missed",), (RED,), "Max"),
+    **{
+        f"{MISSED}/{cause}": Look((cause,), (colour,), "Dots")
+        for cause, colour in zip(CAUSES, (GREY, PURPLE, ORANGE, GREEN, YELLOW, BLUE, RED), strict=True)
+    },
     "/agent/policy_version": Look(("acting",), (ORANGE,), "Steps"),
     "/learner/published_version": Look(("published",), (BLUE,), "Dots"),
     "/learner/loss/critic": Look(("critic",), (BLUE,)),

@@ -10,6 +10,8 @@ from recorder.rows import Floats, Index, Rows, Scalars, Timeline
 from rtcore.config import EnvConfig
 from rtcore.messages import Spec, Step
 
+MISSED = "/agent/missed"  # and, below it, a series for each cause
+
 
 class TickRows:
     """Builds the rows of `/env/**` and `/agent/**`.
@@ -38,11 +40,25 @@ class TickRows:
             Rows("/env/pacing_us", index, _series(_column((s.woke_ns - s.due_ns) / 1e3 for s in steps))),
             Rows("/agent/loop_us", index, _series(_column(_microseconds(s.loop_ns) for s in steps))),
             Rows("/agent/reaction_us", index, _series(_column(_microseconds(s.reaction_ns) for s in steps))),
-            Rows("/agent/missed", index, _series(_column(step.missed for step in steps))),
+            Rows(MISSED, index, _series(_column(step.missed for step in steps))),
             _sparse("/agent/policy_version", index, np.where(versions >= 0, versions, np.nan)),
             _sparse("/env/return", index, returns),
+            *self._causes(steps, index),
         ]
         return [table for table in tables if len(table.index)]
+
+    @staticmethod
+    def _causes(steps: Sequence[Step], index: Index) -> list[Rows]:
+        """A row of 1 per miss on the series of its cause: their numbers add up to the misses."""
+        found = {step.cause for step in steps if step.missed and step.cause}
+        return [
+            _sparse(
+                f"{MISSED}/{cause}",
+                index,
+                _column(1.0 if step.missed and step.cause == cause else float("nan") for step in steps),
+            )
+            for cause in sorted(found)
+        ]
 
     def _drift(self, steps: Sequence[Step], speed: Floats) -> Scalars:
         target = _column(step.drift for step in steps)

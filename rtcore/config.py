@@ -13,6 +13,7 @@ DriftKind = Literal["none", "constant", "sine"]
 MissPolicy = Literal["hold", "neutral", "hold_then_neutral"]
 ScheduleKind = Literal["fixed", "explicit"]
 Rounding = Literal["floor", "ceil", "paper_le"]
+Precision = Literal["float32", "bfloat16", "auto"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +85,7 @@ class ForecastConfig:
     horizon: float | None = None  # units ahead of t_m; None: the window's length
     shrink: float = 0.0  # added to the slope's normal equation, in units^2; >= 0
     trust: Literal["always", "never"] = "always"
+    distil: bool = False  # fit one network to the forecast at t_m, and improve the policy against that
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +108,8 @@ class LearnerConfig:
     replay_capacity: int = 1_000_000  # transitions
     replay_units: float | None = None  # sample only the newest units; None: all
     threads: int = 1
+    precision: Precision = "float32"  # of the networks' products; parameters are float32 in any case
+    governor: Literal["on", "off"] = "on"  # give way to the agent before deadlines are missed
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     forecast: ForecastConfig = field(default_factory=ForecastConfig)
 

@@ -7,7 +7,7 @@ given once, in `Spec`. All `*_ns` stamps are integer nanoseconds of the host's m
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import msgspec
 
@@ -15,7 +15,17 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 Nanos = Annotated[int, msgspec.Meta(ge=0)]
 Index = Annotated[int, msgspec.Meta(ge=-1)]  # -1 means "none"
 
-MissCause = Literal["", "agent_absent", "agent_late", "env_late"]
+MissCause = Literal[
+    "",
+    "agent_absent",
+    "agent_stalled",
+    "agent_late",
+    "policy_swap",
+    "collector_pause",
+    "transport",
+    "env_late",
+]
+CAUSES: tuple[MissCause, ...] = get_args(MissCause)[1:]  # without "", which is none
 Fallback = Literal["", "hold", "neutral"]
 Phase = Literal["update", "hold"]
 Level = Literal["DEBUG", "INFO", "WARN", "ERROR"]
@@ -75,12 +85,13 @@ class Step(Message, frozen=True, kw_only=True):
     policy_version: Index  # policy behind `decision`; 0 is the uniformly random pi_0
     missed: bool  # no answer to observation k-1 at D_k
     fallback: Fallback  # what acted instead
-    cause: MissCause
+    cause: MissCause  # of the miss; known a little later, so on the log only
     skipped: Count  # deadlines lost right before this tick
     loop_ns: Index  # previous step sent -> its answer received here; -1 if none came in time
     reaction_ns: Index  # the agent's own share of it: observation received -> action sent
     drift: float  # the true value; for the recorder and regret, never read by agent or learner
     position: bytes  # float64 simulator qpos (or position), for drawing
+    rehearsal: bool = False  # sent once more to keep the act path warm: on the real-time path only
 
 
 class StepBatch(Message, frozen=True, kw_only=True):
@@ -100,6 +111,14 @@ class Action(Message, frozen=True, kw_only=True):
     policy_version: Count  # 0 is the uniformly random pi_0
     received_ns: Nanos
     sent_ns: Nanos
+    # What may explain a missed deadline, between the previous answer and this one:
+    swap_ns: Nanos = 0  # a policy was checked or swapped in
+    collector_ns: Nanos = 0  # the garbage collector ran
+    starved_ns: Nanos = 0  # the acting thread could have run but had no core
+    # And when the agent's process was last continued after a stop, and since when it answers at all:
+    resumed_ns: Nanos = 0  # 0: never
+    since_ns: Nanos = 0
+    rehearsal: bool = False  # answers a rehearsal: it never acts
 
 
 class Architecture(Message, frozen=True, kw_only=True):

@@ -21,7 +21,7 @@ from rtcore.bus import Bus, BusError
 from rtcore.clock import Clock
 from rtcore.config import ConfigError, RunConfig
 from rtcore.ledger import Ledger
-from rtcore.lifecycle import Stop, die_with_parent, log_to_file, stop_on_signals
+from rtcore.lifecycle import Continuations, Stop, die_with_parent, log_to_file, stop_on_signals
 from rtcore.messages import Stats
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir
@@ -43,19 +43,32 @@ class Process:
     ledger: Ledger
     stop: Stop
     incarnation: int  # its start, monotonic ns
+    continuations: Continuations
 
 
 class Reporter:
     """Publishes a ledger: a few times a second from a thread, and once more at the end."""
 
-    def __init__(self, ledger: Ledger, bus: Bus, clock: Clock, process: str) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        bus: Bus,
+        clock: Clock,
+        process: str,
+        continuations: Continuations | None = None,
+    ) -> None:
         self._ledger = ledger
         self._bus = bus
         self._clock = clock
         self._stats = bus.publisher(channels.STATS, process)
+        self._process = process
+        self._continuations = continuations
 
     def snapshot(self, *, final: bool = False) -> Stats:
-        """The ledger as it is."""
+        """The ledger as it is. A stop and its end are an event in it: no handler may write one."""
+        if self._continuations is not None:
+            for at_ns in self._continuations.untold_ns():
+                self._ledger.event(at_ns, "WARN", f"{self._process}: was stopped, and runs again")
         self._ledger.set_counter("messages.rejected", sum(self._bus.rejected().values()))
         return self._ledger.stats(self._clock.now_ns(), final=final)
 
@@ -126,16 +139,17 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
     incarnation = clock.now_ns()
     ledger = Ledger(role, incarnation)
     connect, listen = (*config.link.connect, *arguments.connect), (*config.link.listen, *arguments.listen)
-    stop = Stop()
+    stop, continuations = Stop(), Continuations(clock.now_ns)
     with (
         stop_on_signals(stop),
+        continuations.watched(),
         open_bus(
             role, run_dir.run_name, run_dir.socket_dir(), clock=clock, connect=connect, listen=listen
         ) as bus,
     ):
         ledger.event(incarnation, "INFO", f"{role}: {placement.describe()}")
-        process = Process(config, run_dir, clock, bus, ledger, stop, incarnation)
-        reporter = Reporter(ledger, bus, clock, role)
+        process = Process(config, run_dir, clock, bus, ledger, stop, incarnation, continuations)
+        reporter = Reporter(ledger, bus, clock, role, continuations)
         try:
             with background(reporter.run, name="reporter", ends=stop):
                 yield process

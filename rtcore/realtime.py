@@ -12,6 +12,7 @@ import contextlib
 import gc
 import os
 import resource
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,9 @@ Collector = Literal["frozen", "on"]
 FIFO_PRIORITY = 50  # the measured one: above ordinary threads, level with the kernel's interrupt threads
 TIMER_SLACK_NS = 1  # the default of 50 us is added to every sleep: p50 83 -> 43 us without it
 NICE = {LEARNER: 5, RECORDER: 10}  # ranks only within one session (autogroup): start all from one launcher
+# How long a thread that acts waits, at most, for the interpreter while another one computes; Python's 5 ms
+# are a whole period at 200 Hz.
+SWITCH_INTERVAL_S = 5e-5
 # On fault: locking what is merely reserved grew a small process from 28 to 171 MB.
 LOCK_FLAGS = libc.MCL_CURRENT | libc.MCL_FUTURE | libc.MCL_ONFAULT
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
@@ -47,7 +51,7 @@ class RealtimeError(RuntimeError):
     def __init__(self, role: str, missing: Sequence[str]) -> None:
         super().__init__(
             f"agent.rt = 'require': {role} is refused {', '.join(missing)}; to grant it:"
-            f" {how_to_grant(missing)}; then start again from that shell"
+            f" {how_to_grant(missing)}; then start again from that shell (`tenuto doctor` knows other ways)"
         )
         self.missing = tuple(missing)
 
@@ -178,7 +182,7 @@ def apply(planned: Plan) -> Placement:
     # The slack first: a FIFO task has none, and newer kernels then ignore the request.
     attempt(SLACK, lambda: libc.prctl(libc.PR_SET_TIMERSLACK, TIMER_SLACK_NS))
     cores, nice, priority = planned.cores, planned.nice, planned.fifo_priority
-    pinned = bool(cores) and attempt(PINNING, lambda: _pin(cores))
+    pinned = bool(cores) and attempt(PINNING, lambda: pin(cores))
     if nice is not None:
         attempt(NICENESS, lambda: _be_nice(nice))
     if priority is not None:
@@ -188,6 +192,7 @@ def apply(planned: Plan) -> Placement:
             missing.append(FIFO)
     locked = planned.lock_memory and attempt(MEMORY, lambda: libc.mlockall(LOCK_FLAGS))
     if planned.freeze_collector:  # no pause in a tick; free, though no gain could be measured at 1 kHz
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -201,6 +206,18 @@ def apply(planned: Plan) -> Placement:
         collector="on" if gc.isenabled() else "frozen",
         missing=tuple(missing),
     )
+
+
+def pin(cores: Sequence[int]) -> None:
+    """Keep all of this process's threads, and those that they start, to these cores.
+
+    Raises:
+        OSError: refused, or none of the cores exists.
+        AttributeError: this system's Python has no such call.
+    """
+    for thread in _threads():
+        with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setaffinity(thread, cores)
 
 
 def allowed_cores() -> tuple[int, ...]:
@@ -228,11 +245,6 @@ def _threads() -> list[int]:
     """This process's threads: numerical libraries start some on import, and each has settings of its own."""
     tasks = Path("/proc/self/task")
     return [int(task.name) for task in tasks.iterdir()] if tasks.exists() else [0]
-
-
-def _pin(cores: Sequence[int]) -> None:
-    for thread in _threads():
-        os.sched_setaffinity(thread, cores)
 
 
 def _be_nice(nice: int) -> None:

@@ -8,12 +8,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from agent_service.inference import UniformPolicy
 from agent_service.service import AgentService
 from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.clock import VirtualClock
 from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Action, Architecture, Policy, Spec, Step
 from rtcore.weights import expected_shapes, pack, sha256
@@ -60,11 +62,11 @@ class Rig:
         self.specs = self.env.publisher(channels.SPEC, "env0")
         self.steps = self.env.publisher(channels.STEP, "env0")
         self.policies = self.learner.publisher(channels.POLICY)
+        self.agent.attend()
 
     def answer(self, observed: Step) -> Action | None:
-        self.steps.put(observed)
         self.agent.poll_policies()
-        self.agent.poll()
+        self.steps.put(observed)
         answers = self.actions.drain()
         assert len(answers) <= 1
         return answers[0].message if answers else None
@@ -96,13 +98,50 @@ def test_pi_0_answers_within_the_bounds_and_repeats_with_its_seed(rig: Rig) -> N
     np.testing.assert_array_equal(drawn, [values(other.answer(step(tick))) for tick in range(50)])
 
 
-def test_only_the_newest_observation_is_answered(rig: Rig) -> None:
+def test_what_waited_behind_a_stall_for_more_than_two_ticks_is_not_answered(rig: Rig) -> None:
     rig.specs.put(SPEC)
-    for tick in range(5):
-        rig.steps.put(step(tick))
-    answer = rig.answer(step(5))
-    assert answer is not None and answer.tick == 5
-    assert rig.ledger.counter("observations") == 1
+    rig.answer(step(0))
+    rig.clock.advance_ns(25_000_000)  # 5 ticks
+    for tick in range(1, 6):
+        rig.steps.put(msgspec.structs.replace(step(tick), sent_ns=tick * 5_000_000))
+    assert [received.message.tick for received in rig.actions.drain()] == [3, 4, 5]
+    assert rig.ledger.counter("observations") == 6
+    assert rig.ledger.counter("observations.superseded") == 2
+
+
+def test_a_rehearsal_swaps_the_policy_in_and_leaves_no_other_trace(rig: Rig) -> None:
+    plain = Rig(MemoryHub())
+    for one in (rig, plain):
+        one.specs.put(SPEC)
+        one.answer(step(0))
+    rehearsed = rig.answer(msgspec.structs.replace(step(0), rehearsal=True))
+    assert rehearsed is not None and rehearsed.rehearsal and rehearsed.tick == 0
+    assert rig.ledger.counter("observations") == rig.ledger.counter("actions") == 1
+    assert rig.ledger.histogram("reaction").count == 1
+    np.testing.assert_array_equal(values(rig.answer(step(1))), values(plain.answer(step(1))))  # same noise
+    rig.policies.put(policy(1))
+    rig.answer(msgspec.structs.replace(step(1), rehearsal=True))
+    assert rig.ledger.counter("policies.adopted") == 1
+    answer = rig.answer(step(2))
+    assert answer is not None and answer.policy_version == 1 and not answer.rehearsal
+
+
+def test_a_malformed_rehearsal_is_refused_like_a_step(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    assert rig.answer(msgspec.structs.replace(step(0, dim=4), rehearsal=True)) is None
+    assert rig.ledger.counter("observations.invalid") == 1
+
+
+def test_what_acting_fails_with_ends_the_run(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no more noise")
+
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    monkeypatch.setattr(UniformPolicy, "act", fail)
+    assert rig.answer(step(1)) is None  # and nothing is raised into the bus
+    with pytest.raises(RuntimeError, match="no more noise"):
+        rig.agent.run(Stop())
 
 
 def test_a_policy_acts_from_the_next_observation_on(rig: Rig) -> None:

@@ -14,12 +14,12 @@ from rtcore.config import EnvConfig, RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
-from rtcore.messages import Step
+from rtcore.messages import CAUSES, Step
 from tests.env_server.scripted import ScriptedAgent, ScriptedWorld
 
 START_NS = 1_000_000_000
 TICK_NS = 10_000_000  # 100 Hz
-MISSES = ("missed.agent_late", "missed.agent_absent", "missed.env_late")
+MISSES = tuple(f"missed.{cause}" for cause in CAUSES)
 
 
 def run_config(*, duration_s: float = 1.0, seed: int = 0, **env: object) -> RunConfig:
@@ -42,12 +42,15 @@ class Rig:
         self.ledger = Ledger("env_server", 1)
         self.world = world or ScriptedWorld()
         self.bus = self.hub.bus("env", self.clock)
+        self.resumed_ns: list[int] = []  # when the env server was continued after a stop
         self.service = EnvService(
-            config, self.world, self.bus, self.clock, self.ledger, 77, wall_ns=lambda: 5_000_000_000
-        )
+            config, self.world, self.bus, self.clock, self.ledger, 77, wall_ns=lambda: 5_000_000_000,
+            resumed_ns=lambda: self.resumed_ns,
+        )  # fmt: skip
         self.agent = ScriptedAgent(self.hub.bus("agent", self.clock), self.clock)
         self.reader = self.hub.bus("reader", self.clock)
         self.log = self.reader.queue(channels.LOG, "*")
+        self.log_copy = self.reader.queue(channels.LOG, "*")  # for a look while it runs
 
     def run(
         self, answer: Callable[[ScriptedAgent, Step], None] = ScriptedAgent.answer, stop: Stop | None = None
@@ -62,6 +65,12 @@ class Rig:
         batches = [received.message for received in self.log.drain()]
         assert [batch.last for batch in batches] == [False] * (len(batches) - 1) + [True]
         return [step for batch in batches for step in batch.steps]
+
+    def causes(self) -> dict[str, int]:
+        """The misses by cause, without the zeros; they add up to `missed`."""
+        found = {cause: self.ledger.counter(f"missed.{cause}") for cause in CAUSES}
+        assert sum(found.values()) == self.ledger.counter("missed")
+        return {cause: count for cause, count in found.items() if count}
 
     def counts(self, *names: str) -> list[int]:
         return [self.ledger.counter(name) for name in names]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from env_server.world import Outcome, Position, Vector
@@ -80,12 +81,14 @@ class ScriptedAgent:
         assert received is not None
         return received.message
 
-    def answer(self, step: Step, *, value: float | None = None, tick: int | None = None) -> None:
+    def answer(
+        self, step: Step, *, value: float | None = None, tick: int | None = None, **stamps: int
+    ) -> None:
+        """`stamps` are fields of `Action`; without them it took 300 ns."""
         values = np.array([step.tick / 1000 if value is None else value], np.float32)
         now_ns = self._clock.now_ns()
-        self._actions.put(
-            Action(
-                env="env0", incarnation=step.incarnation, tick=step.tick if tick is None else tick,
-                values=values.tobytes(), policy_version=5, received_ns=now_ns - 300, sent_ns=now_ns,
-            )
+        answer = Action(
+            env="env0", incarnation=step.incarnation, tick=step.tick if tick is None else tick,
+            values=values.tobytes(), policy_version=5, received_ns=now_ns - 300, sent_ns=now_ns,
         )  # fmt: skip
+        self._actions.put(msgspec.structs.replace(answer, **stamps))

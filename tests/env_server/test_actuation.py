@@ -12,8 +12,6 @@ from env_server.actuation import Actuation, Decision, Rules
 from rtcore.config import MissPolicy
 from rtcore.messages import Action
 
-TICK_NS = 10_000_000
-PLENTY_NS = TICK_NS  # the agent had the whole period
 INCARNATION = 77
 
 
@@ -25,7 +23,6 @@ def make(
     observe: int = 0,
     low: Sequence[float] = (-1.0, -2.0),
     high: Sequence[float] = (1.0, 2.0),
-    tick_ns: int = TICK_NS,
 ) -> Actuation:
     return Actuation(
         Rules(
@@ -35,7 +32,6 @@ def make(
             observe_actions=observe,
             low=np.array(low, np.float32),
             high=np.array(high, np.float32),
-            tick_ns=tick_ns,
             incarnation=INCARNATION,
         )
     )
@@ -56,14 +52,14 @@ def action(
 
 
 def decide(actuation: Actuation, newest: Action | None, expected: int = 9) -> Decision:
-    return actuation.decide(newest, expected_tick=expected, answer_time_ns=PLENTY_NS)
+    return actuation.decide(newest, expected_tick=expected)
 
 
 def test_an_answer_in_time_acts_at_once() -> None:
     decision = decide(make(), action(9, (0.5, -1.5), version=4))
     assert decision.applied.tolist() == decision.decided.tolist() == [0.5, -1.5]
     assert decision.applied.dtype == np.float32
-    assert (decision.missed, decision.fallback, decision.cause) == (False, "", "")
+    assert (decision.missed, decision.fallback) == (False, "")
     assert (decision.policy_version, decision.answered_tick) == (4, 9)
     assert (decision.verdict, decision.clipped) == ("answer", False)
 
@@ -74,7 +70,7 @@ def test_a_miss_holds_the_last_answer_and_says_whose_it_is() -> None:
     for expected in (10, 11, 12):
         decision = decide(actuation, None, expected)
         assert decision.applied.tolist() == [0.5, -1.5]
-        assert (decision.missed, decision.fallback, decision.cause) == (True, "hold", "agent_late")
+        assert (decision.missed, decision.fallback) == (True, "hold")
         assert (decision.policy_version, decision.answered_tick, decision.verdict) == (4, 9, "none")
 
 
@@ -133,7 +129,7 @@ def test_what_is_no_answer_does_not_act(newest: Action, verdict: str) -> None:
     decide(actuation, action(8, (0.125, 0.25), version=2), 8)
     decision = decide(actuation, newest)
     assert decision.verdict == verdict
-    assert (decision.missed, decision.fallback, decision.cause) == (True, "hold", "agent_late")
+    assert (decision.missed, decision.fallback) == (True, "hold")
     assert decision.applied.tolist() == [0.125, 0.25]
     assert (decision.policy_version, decision.answered_tick) == (2, 8)
 
@@ -198,50 +194,6 @@ def test_observed_actions_are_the_decisions_not_yet_applied() -> None:
 def test_observed_actions_are_neutral_at_a_reset() -> None:
     actuation = make(observe=1, low=(0.25, -2.0), high=(1.0, 2.0))
     assert actuation.observed(np.empty(0, np.float32)).tolist() == [0.25, 0.0]
-
-
-def causes(actuation: Actuation, messages: Sequence[Action | None]) -> list[str]:
-    return [decide(actuation, newest, k).cause for k, newest in enumerate(messages)]
-
-
-def test_an_agent_never_heard_is_absent() -> None:
-    assert causes(make(), [None] * 3) == ["agent_absent"] * 3
-
-
-def test_an_agent_is_absent_after_a_second_of_silence() -> None:
-    # 100 Hz: silent for 100 ticks is late, for more is absent
-    messages: list[Action | None] = [action(0), *[None] * 102, action(103), None]
-    found = causes(make(), messages)
-    assert found == ["", *["agent_late"] * 100, *["agent_absent"] * 2, "", "agent_late"]
-
-
-def test_stale_and_invalid_messages_show_that_the_agent_is_there() -> None:
-    stale = action(0)
-    assert causes(make(), [None, None, None, stale, None]) == [
-        "agent_absent", "agent_absent", "agent_absent", "agent_late", "agent_late",
-    ]  # fmt: skip
-
-
-def test_reset_ticks_count_as_silence_or_hearing() -> None:
-    actuation = make(tick_ns=1_000_000_000)  # 1 Hz: absent from the second silent tick on
-    assert actuation.reset(action(0)) == "answer"
-    assert actuation.decide(None, expected_tick=9, answer_time_ns=1_000_000_000).cause == "agent_late"
-    actuation.reset(None)
-    assert actuation.decide(None, expected_tick=9, answer_time_ns=1_000_000_000).cause == "agent_absent"
-
-
-@pytest.mark.parametrize(
-    ("answer_time_ns", "cause"),
-    [(TICK_NS // 2, "agent_late"), (TICK_NS // 2 - 1, "env_late"), (0, "env_late")],
-)
-def test_less_than_half_a_period_to_answer_is_the_env_servers_fault(answer_time_ns: int, cause: str) -> None:
-    actuation = make()
-    decide(actuation, action(8), 8)
-    assert actuation.decide(None, expected_tick=9, answer_time_ns=answer_time_ns).cause == cause
-
-
-def test_an_absent_agent_is_absent_even_when_the_env_server_is_late() -> None:
-    assert make().decide(None, expected_tick=9, answer_time_ns=0).cause == "agent_absent"
 
 
 def test_a_world_cannot_scribble_into_an_action_that_may_be_held() -> None:

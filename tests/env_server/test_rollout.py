@@ -12,7 +12,7 @@ from tests.env_server.scripted import ScriptedWorld
 def make(world: ScriptedWorld, *, episode_steps: int = 4, seed: int = 7, observe: int = 0) -> Rollout:
     rules = Rules(
         on_miss="hold", hold_ticks=1, action_delay_ticks=0, observe_actions=observe, low=world.action_low,
-        high=world.action_high, tick_ns=1000, incarnation=1,
+        high=world.action_high, incarnation=1,
     )  # fmt: skip
     return Rollout(world, Actuation(rules), episode_steps=episode_steps, seed=seed)
 
@@ -26,7 +26,7 @@ def turns(rollout: Rollout, number: int, t: int = 2) -> list[Turn]:
             env="env0", incarnation=1, tick=max(0, tick - 1), values=values, policy_version=1, received_ns=0,
             sent_ns=0,
         )  # fmt: skip
-        result.append(rollout.turn(answer, t, expected_tick=tick - 1, answer_time_ns=1000))
+        result.append(rollout.turn(answer, t, expected_tick=tick - 1))
     return result
 
 

@@ -7,7 +7,10 @@ import pytest
 
 from launcher.summary import discrepancies, summarise
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER
+from rtcore.messages import CAUSES
 from tests.launcher.ledgers import CONFIG, agent_ledger, env_ledger, episode, ledger, whole_run
+
+NOBODY = dict.fromkeys(CAUSES, 0)
 
 
 def summary_of(stats: dict[str, Any]) -> dict[str, Any]:
@@ -43,7 +46,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
             "miss_ratio": 0.015,
             "overruns": 1,
             "skipped": 50,
-            "missed_by_cause": {"agent_late": 2, "agent_absent": 0, "env_late": 1},
+            "missed_by_cause": {**NOBODY, "agent_late": 2, "env_late": 1},
         },
         "reaction_us": dict.fromkeys(nothing, 80.0),
         "loop_us": dict.fromkeys(nothing, 500.0),
@@ -62,13 +65,24 @@ def test_the_whole_summary_of_a_small_run() -> None:
         "windows": [{"m": 0, "t_m": 0, "G": 7, "N": 3}, {"m": 1, "t_m": 10, "G": 7, "N": 3}],
         "operator_holds": 1,
         "transitions": {"produced": 198, "learned": 197, "lost": 1, "duplicate": 5},
-        "learner": {"gradient_steps": 250, "policy_steps": 100, "updates_per_s": 100.0},  # in 2.5 s
+        "learner": {
+            "gradient_steps": 250,
+            "policy_steps": 100,
+            "updates_per_s": 100.0,  # in 2.5 s
+            "governor": {"decisions": 0, "limited_share": None},
+        },
         "forecast": {"windows": None, "error": None, "baseline_error": None},
         "recorder": {"rows": 900, "dropped": 7},
         "restarts": {"env_server": 0, "agent_service": 0, "learner": 0, "recorder": 0},
         "messages": {"rejected": 3},
     }
     assert discrepancies(summary) == []
+
+
+def test_the_governors_share_is_of_the_ticks_that_it_saw() -> None:
+    counters = {"governor.decisions": 3, "governor.ticks": 200, "governor.limited_ticks": 50}
+    summary = summary_of({LEARNER: [ledger(LEARNER, counters=counters)]})
+    assert summary["learner"]["governor"] == {"decisions": 3, "limited_share": 0.25}
 
 
 def test_incarnations_are_added_up() -> None:
@@ -85,7 +99,12 @@ def test_incarnations_are_added_up() -> None:
     assert summary["ticks"] == 300
     assert summary["returns"] == [-30.0, -10.0, 10.0]
     assert summary["mean_return"] == -10.0
-    assert summary["deadlines"]["missed_by_cause"] == {"agent_late": 2, "agent_absent": 1, "env_late": 1}
+    assert summary["deadlines"]["missed_by_cause"] == {
+        **NOBODY,
+        "agent_late": 2,
+        "agent_absent": 1,
+        "env_late": 1,
+    }
     assert summary["loop_us"]["p50"] == pytest.approx(700.0, rel=0.01)
     assert summary["transitions"]["produced"] == 297
     assert summary["transitions"]["lost"] == 100

@@ -69,8 +69,9 @@ def test_every_entity_is_there_and_every_row_stands_on_all_timelines(told: Stage
     assert set(reading.entities(told.path)) == {
         "/env/reward", "/env/return", "/env/drift", "/env/pacing_us",
         "/agent/loop_us", "/agent/reaction_us", "/agent/policy_version", "/agent/missed",
-        "/learner/phase", "/learner/published_version", "/learner/loss/critic", "/learner/loss/actor",
-        "/learner/forecast", "/learner/alpha", "/log", "/run_card",
+        "/agent/missed/agent_late", "/learner/phase", "/learner/published_version",
+        "/learner/loss/critic", "/learner/loss/actor", "/learner/forecast", "/learner/alpha",
+        "/log", "/run_card",
         "/world/point", "/world/follow", "/world/ground",
     }  # fmt: skip
     for entity in set(reading.entities(told.path)) - {"/run_card", "/world/ground"}:
@@ -187,7 +188,7 @@ def test_the_file_is_compact_verified_and_has_one_dashboard(told: Stage) -> None
 
 
 def test_the_books_are_right(told: Stage) -> None:
-    ticks = 6 * 120 + 2 * 120 + (120 - 12) + 12  # six series, the point and its frame, versions, returns
+    ticks = 6 * 120 + 2 * 120 + (120 - 12) + 12 + 1  # six series, point and frame, versions, returns, a cause
     others = 2 + 4 + 3 + 4  # publications, phases, lines, gauges
     assert told.ledger.stats(0).counters == {"rows": ticks + others, "dropped": 0, "live_dropped": 0}
 

@@ -100,6 +100,15 @@ def test_no_answer_in_time_is_a_gap_and_misses_are_counted_tick_by_tick() -> Non
     assert scalars(tables, "/agent/missed")[1] == [[0.0], [1.0], [0.0]]
 
 
+def test_each_miss_stands_on_the_series_of_its_cause() -> None:
+    causes = ("agent_late", "", "env_late", "agent_late")
+    steps = [make_step(k, missed=bool(cause), cause=cause) for k, cause in enumerate(causes)]
+    tables = TickRows(Timeline(SPEC)).rows(steps)
+    assert scalars(tables, "/agent/missed/agent_late") == ([0, 3], [[1.0], [1.0]])
+    assert scalars(tables, "/agent/missed/env_late") == ([2], [[1.0]])
+    assert not has(tables, "/agent/missed/transport")
+
+
 def test_a_tick_without_a_policy_has_no_version() -> None:
     steps = [make_step(0, policy_version=-1), make_step(1, policy_version=0), make_step(2, policy_version=5)]
     assert scalars(TickRows(Timeline(SPEC)).rows(steps), "/agent/policy_version") == ([1, 2], [[0.0], [5.0]])

@@ -16,7 +16,15 @@ from pathlib import Path
 import pytest
 
 from rtcore.clock import VirtualClock
-from rtcore.lifecycle import JsonLines, RateLimited, Stop, die_with_parent, log_to_file, stop_on_signals
+from rtcore.lifecycle import (
+    Continuations,
+    JsonLines,
+    RateLimited,
+    Stop,
+    die_with_parent,
+    log_to_file,
+    stop_on_signals,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -195,6 +203,64 @@ def test_closing_the_log_leaves_logging_as_it_was(tmp_path: Path) -> None:
     handle.close()
     handle.close()
     assert (root.level, root.handlers) == before
+
+
+def test_a_continuation_is_stamped_once_and_told_once() -> None:
+    clock = VirtualClock(5)
+    continuations = Continuations(clock.now_ns)
+    assert (continuations.newest_ns(), continuations.all_ns()) == (0, ())
+    with continuations.watched():
+        for _ in range(20):
+            clock.advance_ns(10)
+            signal.raise_signal(signal.SIGCONT)
+            assert continuations.newest_ns() == clock.now_ns()
+        clock.advance_ns(1)
+        assert continuations.all_ns() == tuple(range(55, 206, 10))  # the newest 16
+        assert list(continuations.untold_ns()) == list(continuations.all_ns())
+        assert list(continuations.untold_ns()) == []
+        signal.raise_signal(signal.SIGCONT)
+        assert list(continuations.untold_ns()) == [206]
+    signal.raise_signal(signal.SIGCONT)
+    assert continuations.newest_ns() == 206
+
+
+def test_other_signals_are_no_continuation() -> None:
+    continuations = Continuations(VirtualClock(5).now_ns)
+    with continuations.watched(), stop_on_signals(stop := Stop()):
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.reason == "SIGTERM"
+        assert continuations.newest_ns() == 0
+        signal.raise_signal(signal.SIGCONT)
+        assert continuations.newest_ns() == 5
+
+
+def test_another_thread_sees_a_continuation_before_the_main_thread_handles_it() -> None:
+    # The main thread is in C code for 0.3 s (one hash), so no handler of Python's runs until its end.
+    child = """
+import hashlib, os, signal, threading, time
+from rtcore.lifecycle import Continuations
+continuations = Continuations(time.monotonic_ns)
+seen = []
+def look():
+    time.sleep(0.05)
+    os.kill(os.getpid(), signal.SIGCONT)
+    limit = time.monotonic() + 20
+    while not continuations.newest_ns() and time.monotonic() < limit:
+        pass
+    seen.append(continuations.newest_ns())
+with continuations.watched():
+    thread = threading.Thread(target=look)
+    thread.start()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 500_000)
+    ended_ns = time.monotonic_ns()
+    thread.join()
+    assert 0 < seen[0] < ended_ns, (seen, ended_ns)
+    assert continuations.all_ns() == tuple(seen)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", child], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_rate_limited_logs_one_line_per_period_and_counts_the_rest(caplog: pytest.LogCaptureFixture) -> None:

@@ -97,7 +97,7 @@ def test_the_error_names_what_is_missing_and_the_command() -> None:
     assert str(error) == (
         "agent.rt = 'require': env_server is refused SCHED_FIFO, locked memory; to grant it:"
         " sudo prlimit --pid $$ --rtprio=50; sudo prlimit --pid $$ --memlock=unlimited;"
-        " then start again from that shell"
+        " then start again from that shell (`tenuto doctor` knows other ways)"
     )
     assert error.missing == (FIFO, MEMORY)
 

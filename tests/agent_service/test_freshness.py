@@ -1,0 +1,35 @@
+"""Which observations are still worth an answer: hand-made stamps at 1 kHz."""
+
+from __future__ import annotations
+
+from agent_service.freshness import MEMORY, Freshness
+
+MS = 1_000_000
+
+
+def test_behind_a_stall_all_but_the_newest_are_old() -> None:
+    freshness = Freshness(MS)
+    assert not freshness.is_old(0, 100_000)
+    # The ways of 50 observations that wait for 50 ms end at the same instant, the shortest last.
+    old = [freshness.is_old(tick * MS, 51 * MS + 100_000) for tick in range(1, 52)]
+    assert old == [True] * 48 + [False] * 3  # excess 50 .. 3 ms; exactly 2 ms, 1 ms and 0 are answered
+
+
+def test_the_clocks_may_be_those_of_two_hosts() -> None:
+    for offset in (-(10**15), 10**15):
+        freshness = Freshness(MS)
+        ways = enumerate((5, 0, 2 * MS))
+        assert [freshness.is_old(k * MS, k * MS + offset + way) for k, way in ways] == [
+            False, False, False,
+        ]  # fmt: skip
+        assert freshness.is_old(9 * MS, 11 * MS + offset + 1)
+
+
+def test_what_was_the_shortest_way_is_forgotten_after_two_memories() -> None:
+    """Clocks that drift apart make every way longer, and no observation is old for it."""
+    freshness = Freshness(MS)
+    freshness.is_old(0, 0)
+    drifted = [freshness.is_old(k * MS, k * MS + 5 * MS) for k in range(1, 2 * MEMORY + 1)]
+    assert drifted[: MEMORY - 1] == [True] * (MEMORY - 1)
+    assert drifted[2 * MEMORY - 1] is False
+    assert not any(Freshness(MS).is_old(k * MS, k * MS + k * 100) for k in range(5 * MEMORY))  # 100 ppm
