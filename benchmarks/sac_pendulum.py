@@ -30,7 +30,7 @@ from stable_baselines3.common.monitor import Monitor
 from benchmarks.intervals import check_seeds, half_interval
 from experiments.presets import gym
 from launcher.sim import simulate
-from rtcore.config import RunConfig
+from rtcore.config import LearnerConfig, Precision, RunConfig
 from rtcore.lifecycle import Stop
 from rtcore.run_dir import RunDir
 
@@ -45,17 +45,18 @@ class Arguments:
     steps: int = 10_000
     seeds: int = 5
     jobs: int = 2
+    precision: Precision = LearnerConfig().precision  # of Tenuto's products
     out: Path = Path("benchmarks/results")
 
 
-def tenuto_config(seed: int, steps: int) -> RunConfig:
+def tenuto_config(seed: int, steps: int, precision: Precision) -> RunConfig:
     """The `gym` preset for so many steps, with the settings that both sides share."""
     base = gym()
     env = replace(base.env, id="Pendulum-v1", hz=20.0, speed=1.0, episode_steps=EPISODE_STEPS, unit_s=0.25)
     learner = replace(
         base.learner,
         algo="sac", utd=1.0, learning_starts=100, hidden=(256, 256), batch=256, gamma=0.99, tau=0.005,
-        actor_lr=1e-3, critic_lr=1e-3, alpha="auto", alpha_lr=1e-3, replay_units=None,
+        actor_lr=1e-3, critic_lr=1e-3, alpha="auto", alpha_lr=1e-3, replay_units=None, precision=precision,
         schedule=replace(base.learner.schedule, kind="fixed", l_f=10, gamma_f=1.0),
     )  # fmt: skip
     ticks = steps + math.ceil(steps / EPISODE_STEPS)  # a reset is a tick of its own
@@ -69,9 +70,9 @@ def tenuto_config(seed: int, steps: int) -> RunConfig:
     )
 
 
-def tenuto_returns(seed: int, steps: int) -> list[float]:
+def tenuto_returns(seed: int, steps: int, precision: Precision) -> list[float]:
     """Training returns of one seed of Tenuto's `sim`."""
-    config = tenuto_config(seed, steps)
+    config = tenuto_config(seed, steps, precision)
     with tempfile.TemporaryDirectory() as directory:
         run_dir = RunDir.create(Path(directory) / "run", config)
         stats, _ = simulate(config, run_dir, Stop(), lambda _: None)
@@ -81,7 +82,7 @@ def tenuto_returns(seed: int, steps: int) -> list[float]:
 def sb3_returns(seed: int, steps: int) -> list[float]:
     """Training returns of one seed of stable-baselines3."""
     torch.set_num_threads(1)
-    learner = tenuto_config(seed, steps).learner
+    learner = tenuto_config(seed, steps, LearnerConfig().precision).learner
     env = Monitor(gymnasium.make("Pendulum-v1"))
     model = stable_baselines3.SAC(
         "MlpPolicy", env, learning_rate=learner.actor_lr, learning_starts=learner.learning_starts,
@@ -110,7 +111,9 @@ def main(arguments: Arguments) -> None:
     check_seeds(arguments.seeds)
     seeds = range(arguments.seeds)
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-        ours_runs = [pool.submit(tenuto_returns, seed, arguments.steps) for seed in seeds]
+        ours_runs = [
+            pool.submit(tenuto_returns, seed, arguments.steps, arguments.precision) for seed in seeds
+        ]
         their_runs = [pool.submit(sb3_returns, seed, arguments.steps) for seed in seeds]
         ours = [run.result() for run in ours_runs]
         theirs = [run.result() for run in their_runs]
@@ -118,6 +121,7 @@ def main(arguments: Arguments) -> None:
         "benchmark": "sac_pendulum",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "steps": arguments.steps,
+        "precision": arguments.precision,
         "versions": {"torch": torch.__version__, "stable_baselines3": stable_baselines3.__version__},
         "tenuto": [score(r) for r in ours],
         "stable_baselines3": [score(r) for r in theirs],

@@ -2,11 +2,15 @@
 
     python -m benchmarks.update_rate --rounds 9
 
-One process, one thread, the contenders by turns in every round: Tenuto's SAC (with the policy, and as
-in a hold), its FSAC against a forecast, and stable-baselines3's SAC with the same networks, batch and
-rates on the same transitions. The floor is the time that one update's matrix products alone take at the
-rate that torch reaches on large ones, measured in the same rounds. Rates are per CPU second, so that
-other work on the machine distorts them less; the wall rate stands beside them.
+One process, one thread, the contenders by turns in every round, in each precision: Tenuto's SAC (with the
+policy, and as in a hold), its FSAC against a forecast and against a distilled one, and stable-baselines3's
+SAC with the same networks, batch and rates on the same transitions. Then the policy's step alone: the
+actor's pass, the climb of the critics or of the forecast, the gradient, the optimiser.
+
+The floor is the time that the matrix products alone take at the rate that torch reaches on large ones in
+that precision, measured in the same rounds. Rates are per CPU second, so that other work on the machine
+distorts them less; the wall rate stands beside them. The distilled forecast is measured after its first
+exact steps, with those that it takes every so many afterwards; the first ones cost what the forecast does.
 """
 
 from __future__ import annotations
@@ -17,9 +21,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -29,105 +32,89 @@ import tyro
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
-from learner.fsac import Fsac
+from benchmarks.learners import (
+    TRANSITIONS,
+    Floats,
+    MeasuredSac,
+    Size,
+    gemm_rate,
+    make_fsac,
+    make_replay,
+    make_sac,
+    policy_flops,
+    random_transitions,
+    value_flops,
+)
+from learner.arithmetic import product_type
+from learner.distil import FIRST_FITS, FIT_EVERY
 from learner.memory import keep_freed_memory
 from learner.replay import Replay
 from learner.sac import Sac
-from rtcore.config import ForecastConfig, LearnerConfig
-from rtcore.windows import Window
+from rtcore.config import LearnerConfig, Precision
 
-TRANSITIONS = 5000
 WARM_UP = 20
-GEMM_SIZE = 1024
 PEER = "stable-baselines3 SAC"
+
+Kind = Literal["update", "policy step"]
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """What to measure; the dimensions are HalfCheetah's."""
+class Arguments(Size):
+    """What to measure."""
 
-    observation_dim: int = 17
-    action_dim: int = 6
-    hidden: tuple[int, ...] = (256, 256)
-    batch: int = 256
-    snapshots: tuple[int, ...] = (5, 10)  # l_p of the FSAC rows
+    precisions: tuple[Precision, ...] = ("float32", "bfloat16")
+    snapshots: tuple[int, ...] = (5, 10, 20)  # l_p of the forecasts
+    distilled: int = 10  # l_p of the forecast that is distilled
     rounds: int = 9
-    updates: int = 40  # per contender and round
+    updates: int = 2 * FIT_EVERY  # per contender and round; the distilled forecast's exact steps fit in
     keep_memory: bool = True  # as the learner process does: learner.memory
     out: Path = Path("benchmarks/results")
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Something that makes updates.
+    """Something that makes updates, or steps of the policy alone.
 
     Attributes:
-        flops: of the matrix products that one of its updates cannot do without.
-        run: make so many updates.
+        flops: of the matrix products that one of them cannot do without.
+        run: make so many.
     """
 
     name: str
-    flops: int
+    kind: Kind
+    precision: Precision
+    flops: float
     run: Callable[[int], None]
 
 
-def update_flops(arguments: Arguments, *, policy: bool, snapshots: int = 1) -> int:
-    """Floating point operations in the matrix products of one update.
-
-    Targets, critics (forward, weights, inputs of all layers but the first) and the next action; with
-    `policy` also the actor (likewise) and, per snapshot, twin critics forward and back to the action.
-    """
-    critic = _products([arguments.observation_dim + arguments.action_dim, *arguments.hidden, 1])
-    actor = _products([arguments.observation_dim, *arguments.hidden, 2 * arguments.action_dim])
-    total = 2 * sum(critic) + 2 * (3 * sum(critic) - critic[0]) + sum(actor)
-    if policy:
-        total += (3 * sum(actor) - actor[0]) + snapshots * 2 * 2 * sum(critic)
-    return 2 * arguments.batch * total
-
-
-def _products(widths: Sequence[int]) -> list[int]:
-    return [width * out for width, out in pairwise(widths)]
-
-
-def random_transitions(arguments: Arguments) -> dict[str, NDArray[np.float32]]:
-    """The data that all contenders learn from."""
-    rng = np.random.default_rng(0)
-    shape = (TRANSITIONS, arguments.observation_dim)
-    return {
-        "observation": rng.standard_normal(shape, np.float32),
-        "action": rng.uniform(-1, 1, (TRANSITIONS, arguments.action_dim)).astype(np.float32),
-        "reward": rng.standard_normal(TRANSITIONS, np.float32),
-        "next_observation": rng.standard_normal(shape, np.float32),
-    }
-
-
-def our_contenders(arguments: Arguments, data: dict[str, NDArray[np.float32]]) -> list[Contender]:
-    """Tenuto's SAC twice, improving and holding, and FSAC once per number of snapshots."""
-    replay = Replay(TRANSITIONS, arguments.observation_dim, arguments.action_dim)
-    for s, a, r, s_next in zip(*data.values(), strict=True):
-        replay.add(s, a, float(r), s_next, False, 0)
-    config = LearnerConfig(algo="sac", hidden=arguments.hidden, batch=arguments.batch)
-    dims = (arguments.observation_dim, arguments.action_dim)
+def our_contenders(arguments: Arguments, precision: Precision, replay: Replay) -> list[Contender]:
+    """Tenuto's in one precision: SAC improving and holding, FSAC, and the policy's step of each."""
+    config = LearnerConfig(precision=precision)
+    value, plain = value_flops(arguments), policy_flops(arguments)
+    sac = make_sac(arguments, config, replay)
+    holding = make_sac(arguments, config, replay)
     found = [
-        Contender("tenuto SAC", update_flops(arguments, policy=True), _runner(Sac(config, *dims, 0, replay))),
-        Contender(
-            "tenuto SAC, hold",
-            update_flops(arguments, policy=False),
-            _runner(Sac(config, *dims, 0, replay), improve=False),
-        ),
+        Contender("SAC", "update", precision, value + plain, _updates(sac)),
+        Contender("SAC, hold", "update", precision, value, _updates(holding, improve=False)),
+        Contender("SAC", "policy step", precision, plain, _policy_steps(sac)),
     ]
-    for count in arguments.snapshots:
-        fsac = Fsac(replace(config, algo="fsac", forecast=ForecastConfig(l_p=count)), *dims, 0, replay)
-        for unit in range(count):
-            fsac.update(improve_policy=True)
-            fsac.end_unit(unit)
-        fsac.begin_window(Window(m=1, start=count, update=10, hold=0), count)
-        flops = update_flops(arguments, policy=True, snapshots=count)
-        found.append(Contender(f"tenuto FSAC, l_p = {count}", flops, _runner(fsac)))
+    students = [
+        (f"FSAC, l_p = {count}", make_fsac(arguments, config, replay, count),
+         float(policy_flops(arguments, critics=2 * count)))
+        for count in arguments.snapshots
+    ]  # fmt: skip
+    distilled = make_fsac(arguments, config, replay, arguments.distilled, distil=True)
+    _updates(distilled)(FIRST_FITS + FIT_EVERY - FIRST_FITS % FIT_EVERY)
+    exact = policy_flops(arguments, critics=2 * arguments.distilled)
+    mean = policy_flops(arguments, critics=1) * (1 - 1 / FIT_EVERY) + exact / FIT_EVERY
+    students.append((f"FSAC, l_p = {arguments.distilled}, distilled", distilled, mean))
+    for name, student, flops in students:
+        found.append(Contender(name, "update", precision, value + flops, _updates(student)))
+        found.append(Contender(name, "policy step", precision, flops, _policy_steps(student)))
     return found
 
 
-def _runner(student: Sac, *, improve: bool = True) -> Callable[[int], None]:
+def _updates(student: Sac, *, improve: bool = True) -> Callable[[int], None]:
     def run(updates: int) -> None:
         for _ in range(updates):
             student.update(improve_policy=improve)
@@ -135,17 +122,23 @@ def _runner(student: Sac, *, improve: bool = True) -> Callable[[int], None]:
     return run
 
 
+def _policy_steps(student: MeasuredSac) -> Callable[[int], None]:
+    def run(updates: int) -> None:
+        for _ in range(updates):
+            student.policy_step()
+
+    return run
+
+
 class _Shapes(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """Only the spaces: nothing steps it."""
 
-    def __init__(self, arguments: Arguments) -> None:
-        self.observation_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (arguments.observation_dim,), np.float32
-        )
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (arguments.action_dim,), np.float32)
+    def __init__(self, size: Size) -> None:
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size.observation_dim,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (size.action_dim,), np.float32)
 
 
-def peer(arguments: Arguments, data: dict[str, NDArray[np.float32]]) -> Contender:
+def peer(arguments: Arguments, data: dict[str, Floats]) -> Contender:
     """stable-baselines3's SAC.train, in calls as long as the blocks."""
     defaults = LearnerConfig()
     model = stable_baselines3.SAC(
@@ -159,63 +152,64 @@ def peer(arguments: Arguments, data: dict[str, NDArray[np.float32]]) -> Contende
     no = np.zeros(1, np.bool_)
     for s, a, r, s_next in zip(*data.values(), strict=True):
         buffer.add(s[None], s_next[None], a[None], np.array([r]), no, [{}])
-    return Contender(
-        PEER, update_flops(arguments, policy=True), lambda updates: model.train(updates, arguments.batch)
-    )
+    flops = value_flops(arguments) + policy_flops(arguments)
+    run: Callable[[int], None] = lambda updates: model.train(updates, arguments.batch)  # noqa: E731
+    return Contender(PEER, "update", "float32", flops, run)
 
 
-def measure_gemm() -> float:
-    """Floating point operations per CPU second in large matrix products."""
-    a, b = torch.randn(GEMM_SIZE, GEMM_SIZE), torch.randn(GEMM_SIZE, GEMM_SIZE)
-    out = torch.empty(GEMM_SIZE, GEMM_SIZE)
-    times = []
-    for _ in range(6):
-        begin = time.process_time()
-        torch.mm(a, b, out=out)
-        times.append(time.process_time() - begin)
-    return 2 * GEMM_SIZE**3 / min(times)
-
-
-def measure(contenders: Sequence[Contender], arguments: Arguments) -> tuple[list[dict[str, Any]], float]:
-    """One row per contender, and the rate of matrix products; all by turns."""
-    cpu: dict[str, list[float]] = {contender.name: [] for contender in contenders}
-    wall: dict[str, list[float]] = {contender.name: [] for contender in contenders}
-    gemm = []
+def measure(contenders: Sequence[Contender], arguments: Arguments) -> list[dict[str, Any]]:
+    """One row per contender; all by turns, the matrix products as well."""
+    cpu: list[list[float]] = [[] for _ in contenders]
+    wall: list[list[float]] = [[] for _ in contenders]
+    products: dict[Precision, list[float]] = {contender.precision: [] for contender in contenders}
     for contender in contenders:
-        contender.run(WARM_UP)
+        contender.run(WARM_UP - WARM_UP % FIT_EVERY)
     for _ in range(arguments.rounds):
-        gemm.append(measure_gemm())
-        for contender in contenders:
+        for precision, rates in products.items():
+            rates.append(gemm_rate(product_type(precision)))
+        for index, contender in enumerate(contenders):
             begin_wall, begin_cpu = time.perf_counter(), time.process_time()
             contender.run(arguments.updates)
-            cpu[contender.name].append(arguments.updates / (time.process_time() - begin_cpu))
-            wall[contender.name].append(arguments.updates / (time.perf_counter() - begin_wall))
-    rate = statistics.median(gemm)
-    rows = []
-    for contender in contenders:
-        mine = cpu[contender.name]
-        ratios = [ours / theirs for ours, theirs in zip(mine, cpu[PEER], strict=True)]
-        rows.append({
-            "name": contender.name,
-            "updates_per_cpu_s": statistics.median(mine),
-            "updates_per_s": statistics.median(wall[contender.name]),
-            "ratio_to_peer": statistics.median(ratios),
-            "flops": contender.flops,
-            "floor_updates_per_s": rate / contender.flops,
-            "share_of_floor": statistics.median(mine) * contender.flops / rate,
-            "rounds_per_cpu_s": mine,
+            cpu[index].append(arguments.updates / (time.process_time() - begin_cpu))
+            wall[index].append(arguments.updates / (time.perf_counter() - begin_wall))
+    found = []
+    for index, contender in enumerate(contenders):
+        rate = statistics.median(products[contender.precision])
+        found.append({
+            "name": contender.name, "kind": contender.kind, "precision": contender.precision,
+            "per_cpu_s": statistics.median(cpu[index]), "per_s": statistics.median(wall[index]),
+            "flops": contender.flops, "gemm_flops_per_cpu_s": rate,
+            "floor_per_s": rate / contender.flops,
+            "share_of_floor": statistics.median(cpu[index]) * contender.flops / rate,
+            "rounds_per_cpu_s": cpu[index],
         })  # fmt: skip
-    return rows, rate
+    return found
+
+
+def compare(rows: list[dict[str, Any]]) -> None:
+    """Add to each row how it compares: an update with the peer's, a policy step with SAC's in its precision.
+
+    `rate_of_peer` is a ratio of rates, `cost_of_plain` one of times; both medians over the rounds.
+    """
+    reference = {(row["name"], row["kind"], row["precision"]): row["rounds_per_cpu_s"] for row in rows}
+    for row in rows:
+        mine = row["rounds_per_cpu_s"]
+        theirs = reference[PEER, "update", "float32"]
+        plain = reference.get(("SAC", row["kind"], row["precision"]), mine)
+        if row["kind"] == "update":
+            row["rate_of_peer"] = statistics.median(a / b for a, b in zip(mine, theirs, strict=True))
+        row["cost_of_plain"] = statistics.median(b / a for a, b in zip(mine, plain, strict=True))
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """One line per contender."""
-    lines = [f"{'':24} {'per CPU s':>9} {'per s':>7} {'of peer':>8} {'floor':>7} {'of floor':>9}"]
-    lines += [
-        f"{row['name']:24} {row['updates_per_cpu_s']:9.1f} {row['updates_per_s']:7.1f}"
-        f" {row['ratio_to_peer']:7.2f}x {row['floor_updates_per_s']:7.1f} {row['share_of_floor']:9.0%}"
-        for row in rows
-    ]
+    lines = [f"{'':47}{'per CPU s':>10}{'per s':>8}{'of peer':>9}{'cost':>7}{'floor':>8}{'of floor':>9}"]
+    for row in rows:
+        ratio = f"{row['rate_of_peer']:8.2f}x" if "rate_of_peer" in row else " " * 9
+        lines.append(
+            f"{row['kind']:12}{row['name']:26}{row['precision']:9}{row['per_cpu_s']:10.1f}{row['per_s']:8.1f}"
+            f"{ratio}{row['cost_of_plain']:6.2f}x{row['floor_per_s']:8.1f}{row['share_of_floor']:9.0%}"
+        )
     return "\n".join(lines)
 
 
@@ -224,15 +218,22 @@ def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     kept = arguments.keep_memory and keep_freed_memory()
     data = random_transitions(arguments)
-    rows, rate = measure([*our_contenders(arguments, data), peer(arguments, data)], arguments)
-    print(f"matrix products: {rate / 1e9:.0f} GFLOP/s; freed memory kept: {kept}")
+    replay = make_replay(arguments, data)
+    contenders = [peer(arguments, data)]
+    for precision in arguments.precisions:
+        contenders += our_contenders(arguments, precision, replay)
+    rows = measure(contenders, arguments)
+    compare(rows)
+    rows.sort(key=lambda row: str(row["kind"]), reverse=True)
+    gemm = {row["precision"]: row["gemm_flops_per_cpu_s"] for row in rows}
+    rates = ", ".join(f"{precision} {rate / 1e9:.0f} GFLOP/s" for precision, rate in gemm.items())
+    print(f"matrix products: {rates}; freed memory kept: {kept}")
     print(table(rows))
     found = {
         "benchmark": "update_rate",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"torch": torch.__version__, "stable_baselines3": stable_baselines3.__version__},
         "arguments": asdict(replace(arguments, keep_memory=kept)) | {"out": str(arguments.out)},
-        "gemm_flops_per_cpu_s": rate,
         "rows": rows,
     }
     arguments.out.mkdir(parents=True, exist_ok=True)

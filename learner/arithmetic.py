@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from learner.memory import keep_freed_memory
+from rtcore.config import Precision
 
 
 def prepare(threads: int) -> None:
@@ -15,3 +16,11 @@ def prepare(threads: int) -> None:
     """
     torch.set_num_threads(threads)
     keep_freed_memory()
+
+
+def product_type(precision: Precision) -> torch.dtype:
+    """In what the networks' products are computed here; "auto" is bfloat16 where the processor has it."""
+    if precision == "auto":
+        able = torch.cpu.get_capabilities()
+        precision = "bfloat16" if able.get("avx512_bf16") or able.get("amx_bf16") else "float32"
+    return torch.bfloat16 if precision == "bfloat16" else torch.float32

@@ -19,7 +19,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 MANIFEST = "manifest.json"
-_SCHEMA = 1
+_SCHEMA = 2  # 1: the actor's weights were [out, in]
 _KEEP_DIGITS = 16  # of the hash, in the tensors file's name
 
 

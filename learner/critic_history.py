@@ -2,37 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor
 
-from learner.networks import FlatParameters, min_q
+from learner.gradients import Mlp
+from learner.networks import FlatParameters
 
 
-@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The twin critics as they were at one instant. Nothing writes to them again.
 
     Attributes:
         time: the unit at whose beginning the critics were so: t + 1 for the end of unit t.
-        parameters: by name; memory of the snapshot's own.
+        parameters: memory of the snapshot's own.
+        net: the same, ready for products.
     """
 
-    time: int
-    parameters: Mapping[str, Tensor]
-
-    def value(self, observation: Tensor, action: Tensor) -> Tensor:
-        """The smaller of both critics' values, [B], differentiable in `action`."""
-        return min_q(tuple(self.parameters.values()), observation, action)
+    def __init__(self, time: int, parameters: FlatParameters, precision: torch.dtype) -> None:
+        self.time, self.parameters = time, parameters
+        self.net = Mlp(parameters, precision)
 
 
 class CriticHistory:
     """The newest `length` snapshots, oldest first."""
 
-    def __init__(self, length: int) -> None:
-        self._length = length
+    def __init__(self, length: int, precision: torch.dtype) -> None:
+        self._length, self._precision = length, precision
         self.snapshots: tuple[Snapshot, ...] = ()
 
     def push(self, time: int, critic: FlatParameters) -> None:
@@ -41,10 +35,8 @@ class CriticHistory:
         Snapshots that are not older than `time` are dropped: the unit ended a second time, after a
         restart that went back.
         """
-        with torch.no_grad():
-            copy = Snapshot(time, critic.views(critic.flat.clone()))
         older = tuple(snapshot for snapshot in self.snapshots if snapshot.time < time)
-        self.restore((*older, copy))
+        self.restore((*older, Snapshot(time, critic.frozen_copy(), self._precision)))
 
     def restore(self, snapshots: tuple[Snapshot, ...]) -> None:
         """Hold the newest of `snapshots`, which come oldest first."""

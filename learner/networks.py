@@ -1,26 +1,21 @@
-"""The actor and the twin critics, as functions of flat parameter buffers.
+"""Parameters in flat buffers, their optimiser, and the networks that are made of them.
 
 Each network's parameters lie in one contiguous float32 buffer, so that an optimiser step, a
-soft target update and a frozen copy are one operation each. Shapes in here: B is the batch,
-O and A the observation's and the action's dimension, H a hidden width.
+soft target update and a frozen copy are one operation each.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 from torch.optim.adam import adam
 
-LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
-
-_LOG_2 = math.log(2.0)
-_HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 _ALIGN = 16  # floats: every view starts on 64 bytes, where BLAS results do not depend on the address
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -31,20 +26,20 @@ class FlatParameters:
 
     Attributes:
         flat: [n], the values, with zeros between the views.
-        grad: [n], where backward passes through `leaves` add their gradients.
-        leaves: the parameters in order, for autograd.
-        frozen: the same memory, without gradients: a backward pass through them stops there.
+        grad: [n], their gradients; [0] where nothing is trained.
     """
 
-    def __init__(self, shapes: Shapes) -> None:
+    def __init__(self, shapes: Shapes, *, trained: bool = True) -> None:
         self._shapes = dict(shapes)
         size = sum(_padded(math.prod(shape)) for shape in self._shapes.values())
         self.flat = torch.zeros(size)
-        self.grad = torch.zeros(size)
-        self.frozen = tuple(self.views(self.flat).values())
-        self.leaves = tuple(view.detach().requires_grad_() for view in self.frozen)
-        for leaf, grad in zip(self.leaves, self.views(self.grad).values(), strict=True):
-            leaf.grad = grad
+        self.grad = torch.zeros(size if trained else 0)
+
+    def frozen_copy(self) -> FlatParameters:
+        """The values as they are now, in memory of their own, not to be trained."""
+        copy = FlatParameters(self._shapes, trained=False)
+        copy.flat.copy_(self.flat)
+        return copy
 
     def views(self, buffer: Tensor) -> dict[str, Tensor]:
         """The named parts of `buffer`, which has the layout of `flat`."""
@@ -54,13 +49,6 @@ class FlatParameters:
             parts[name] = buffer[start : start + length].view(shape)
             start += _padded(length)
         return parts
-
-    def initialise(self, rng: np.random.Generator, fan_in: Mapping[str, int]) -> None:
-        """Draw each parameter from U(-b, b), b = 1 / sqrt(fan_in): the default of torch's Linear."""
-        for name, view in self.views(self.flat).items():
-            bound = 1.0 / math.sqrt(fan_in[name])
-            values = rng.uniform(-bound, bound, self._shapes[name]).astype(np.float32)
-            view.copy_(torch.from_numpy(values))
 
 
 class Adam:
@@ -86,107 +74,63 @@ class Adam:
         )  # fmt: skip
 
 
+def make_networks(
+    nets: int, widths: Sequence[int], rng: np.random.Generator | None, *, trained: bool = True
+) -> FlatParameters:
+    """`nets` perceptrons of one shape side by side; zeros without `rng`.
+
+    Layer i has `i.weight` [nets, in, out] and `i.bias` [nets, 1, out], both drawn from U(-b, b),
+    b = 1 / sqrt(in), as torch's Linear does by default.
+
+    Args:
+        nets: how many.
+        widths: of the input, the hidden layers and the output.
+        rng: where the draw comes from.
+        trained: whether to keep room for gradients.
+    """
+    shapes: dict[str, tuple[int, ...]] = {}
+    for index, (width, out) in enumerate(pairwise(widths)):
+        shapes |= {f"{index}.weight": (nets, width, out), f"{index}.bias": (nets, 1, out)}
+    networks = FlatParameters(shapes, trained=trained)
+    if rng is None:
+        return networks
+    for name, view in networks.views(networks.flat).items():
+        bound = 1.0 / math.sqrt(widths[int(name.partition(".")[0])])
+        values = rng.uniform(-bound, bound, shapes[name]).astype(np.float32)
+        view.copy_(torch.from_numpy(values))
+    return networks
+
+
 def make_actor(
     observation_dim: int, action_dim: int, hidden: Sequence[int], rng: np.random.Generator
 ) -> FlatParameters:
-    """A ReLU trunk and one last layer that holds both heads: rows [0, A) the mean, [A, 2A) log std.
-
-    Weights are [out, in], as torch's Linear has them.
-    """
-    shapes: dict[str, tuple[int, ...]] = {}
-    fan_in: dict[str, int] = {}
-    width = observation_dim
-    for index, out in enumerate(hidden):
-        shapes |= {f"trunk.{index}.weight": (out, width), f"trunk.{index}.bias": (out,)}
-        fan_in |= {f"trunk.{index}.weight": width, f"trunk.{index}.bias": width}
-        width = out
-    shapes |= {"heads.weight": (2 * action_dim, width), "heads.bias": (2 * action_dim,)}
-    fan_in |= {"heads.weight": width, "heads.bias": width}
-    actor = FlatParameters(shapes)
-    actor.initialise(rng, fan_in)
-    return actor
+    """A network whose last layer holds both heads: outputs [0, A) the mean, [A, 2A) log std."""
+    return make_networks(1, [observation_dim, *hidden, 2 * action_dim], rng)
 
 
 def make_twin_critic(
     observation_dim: int, action_dim: int, hidden: Sequence[int], rng: np.random.Generator | None
 ) -> FlatParameters:
-    """Two critics side by side: weights [2, in, out], biases [2, 1, out]; zeros without `rng`.
+    """Two critics side by side, from observation and action to one value.
 
-    The last layer has one output and is kept as a row, [2, 1, in]: a matrix product with one
-    column took 98 us, a product and a sum 17 us (B = H = 256).
+    Without `rng` they are zeros and not trained: targets.
     """
-    shapes: dict[str, tuple[int, ...]] = {}
-    fan_in: dict[str, int] = {}
-    width = observation_dim + action_dim
-    for index, out in enumerate(hidden):
-        shapes |= {f"{index}.weight": (2, width, out), f"{index}.bias": (2, 1, out)}
-        fan_in |= {f"{index}.weight": width, f"{index}.bias": width}
-        width = out
-    last = len(hidden)
-    shapes |= {f"{last}.weight": (2, 1, width), f"{last}.bias": (2, 1)}
-    fan_in |= {f"{last}.weight": width, f"{last}.bias": width}
-    critic = FlatParameters(shapes)
-    if rng is not None:
-        critic.initialise(rng, fan_in)
-    return critic
-
-
-def policy_heads(parameters: Sequence[Tensor], observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and log standard deviation of the Gaussian before tanh, [B, A] each."""
-    hidden = observation
-    for layer in range(0, len(parameters) - 2, 2):
-        hidden = torch.relu_(functional.linear(hidden, parameters[layer], parameters[layer + 1]))
-    mean, log_std = functional.linear(hidden, parameters[-2], parameters[-1]).chunk(2, dim=-1)
-    return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
-
-
-def squashed_gaussian(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """An action a = tanh(u), u = mean + std * noise, and its log density (Haarnoja et al. 2018, appendix C).
-
-        log pi(a|s) = sum_i [log N(u_i; mean_i, std_i) - log(1 - tanh(u_i)^2)]
-
-    with log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u)), which stays exact where tanh saturates.
-
-    Args:
-        mean: [B, A], of the Gaussian before tanh.
-        log_std: [B, A], log of its standard deviation.
-        noise: [B, A], standard normal.
-
-    Returns:
-        Action [B, A] in (-1, 1), and log density [B] in nats.
-    """
-    u = mean + log_std.exp() * noise
-    log_normal = -0.5 * noise.square() - log_std - _HALF_LOG_2_PI
-    log_slope = 2.0 * (_LOG_2 - u - functional.softplus(-2.0 * u))
-    return torch.tanh(u), (log_normal - log_slope).sum(-1)
-
-
-def twin_q(parameters: Sequence[Tensor], observation: Tensor, action: Tensor) -> Tensor:
-    """Both critics' values, [2, B]."""
-    joined = torch.cat((observation, action), dim=-1)
-    hidden = joined.expand(2, *joined.shape)
-    for layer in range(0, len(parameters) - 2, 2):
-        hidden = torch.relu_(torch.baddbmm(parameters[layer + 1], hidden, parameters[layer]))
-    return (hidden * parameters[-2]).sum(-1) + parameters[-1]
-
-
-def min_q(parameters: Sequence[Tensor], observation: Tensor, action: Tensor) -> Tensor:
-    """The smaller of both critics' values, [B]."""
-    first, second = twin_q(parameters, observation, action).unbind(0)
-    return torch.minimum(first, second)
+    return make_networks(2, [observation_dim + action_dim, *hidden, 1], rng, trained=rng is not None)
 
 
 def policy_arrays(actor: FlatParameters, action_dim: int) -> dict[str, NDArray[np.float32]]:
-    """Float32 copies of the actor's parameters under their published names, heads apart."""
+    """Float32 copies of the actor's parameters as they are published: [out, in], the heads apart."""
     arrays: dict[str, NDArray[np.float32]] = {}
-    for name, view in actor.views(actor.flat).items():
-        values = view.numpy().copy()
-        if name.startswith("heads."):
-            kind = name.removeprefix("heads.")
+    views = actor.views(actor.flat)
+    last = f"{len(views) // 2 - 1}."
+    for name, view in views.items():
+        values = view[0].numpy().T if name.endswith("weight") else view[0, 0].numpy()
+        if name.startswith(last):
+            kind = name.removeprefix(last)
             arrays[f"mean.{kind}"] = values[:action_dim].copy()
             arrays[f"log_std.{kind}"] = values[action_dim:].copy()
         else:
-            arrays[name] = values
+            arrays[f"trunk.{name}"] = values.copy()
     return arrays
 
 

@@ -16,19 +16,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from learner.arithmetic import product_type
 from learner.checkpoint import State, require_fit
-from learner.networks import (
-    Adam,
-    FlatParameters,
-    make_actor,
-    make_twin_critic,
-    min_q,
-    policy_arrays,
-    policy_heads,
-    squashed_gaussian,
-    twin_q,
+from learner.gradients import (
+    Mlp,
+    Pass,
+    Proposal,
+    climb,
+    critic_loss_to_output,
+    policy_loss_to_heads,
+    propose,
+    smaller,
 )
-from learner.replay import Batch, Replay, make_batch
+from learner.networks import Adam, FlatParameters, make_actor, make_twin_critic, policy_arrays
+from learner.replay import Replay, make_batch
+from learner.tensors import BatchTensors
 from rtcore.config import LearnerConfig
 from rtcore.messages import Architecture
 from rtcore.windows import Window
@@ -67,9 +69,8 @@ class Sac:
         self._build_networks()
         self._build_temperature()
         self._batch = make_batch(config.batch, observation_dim, action_dim)
-        self._sampled = _Tensors(self._batch)
-        self._noise = np.zeros((config.batch, action_dim), np.float32)
-        self._next_noise = np.zeros_like(self._noise)
+        self._sampled = BatchTensors(self._batch)
+        self._build_passes()
         self._last: dict[str, Tensor] = {}  # what `metrics` reads, not yet fetched
 
     def _build_networks(self) -> None:
@@ -82,10 +83,28 @@ class Sac:
         self._actor_adam = Adam(self._actor.flat, self._actor.grad, self._config.actor_lr)
         self._critic_adam = Adam(self._critic.flat, self._critic.grad, self._config.critic_lr)
 
+    def _build_passes(self) -> None:
+        """The networks ready for products, and room for a batch on its way through them.
+
+        The actor takes s in its first B rows and s' in the others, so that an update needs one pass
+        through it.
+        """
+        shape, rows = self.architecture, self._config.batch
+        self._precision = product_type(self._config.precision)
+        networks = (self._actor, self._critic, self._target)
+        self._actor_net, self._critic_net, self._target_net = (
+            Mlp(network, self._precision) for network in networks
+        )
+        observation, action, hidden = shape.observation_dim, shape.action_dim, list(shape.hidden)
+        self._both = Pass(1, 2 * rows, [observation, *hidden, 2 * action], self._precision)
+        self._now, self._next = self._both.rows(0, rows), self._both.rows(rows, 2 * rows)
+        self._values = Pass(2, rows, [observation + action, *hidden, 1], self._precision)
+        self._noise = np.zeros((2 * rows, action), np.float32)
+
     def _build_temperature(self) -> None:
         config = self._config
         self._tuned = config.alpha == "auto"
-        self._fixed_alpha = torch.tensor(1.0 if config.alpha == "auto" else config.alpha)
+        self._fixed_alpha = 1.0 if config.alpha == "auto" else config.alpha
         self._log_alpha = FlatParameters({"log_alpha": (1,)})  # tuned from alpha = 1 on
         self._alpha_adam = Adam(self._log_alpha.flat, self._log_alpha.grad, config.alpha_lr)
         entropy = config.target_entropy
@@ -102,16 +121,17 @@ class Sac:
             ValueError: the replay holds no transition.
         """
         self._draw_batch()
-        alpha = self._log_alpha.frozen[0].exp() if self._tuned else self._fixed_alpha
+        alpha = math.exp(self._log_alpha.flat[0].item()) if self._tuned else self._fixed_alpha
         if improve_policy:
-            action, log_prob = self._propose(self._sampled.observation)
-            self._temperature_step(log_prob.detach())
-            self._critic_step(alpha)
-            self._actor_step(alpha, action, log_prob)
+            now, following = self._propose_both()
+            self._temperature_step(now.log_prob)
+            self._critic_step(alpha, following)
+            self._actor_step(alpha, now)
             self.policy_steps += 1
         else:
-            self._critic_step(alpha)
+            self._critic_step(alpha, self._propose_next())
         self._target.flat.lerp_(self._critic.flat, self._config.tau)
+        self._target_net.refresh()
         self.gradient_steps += 1
 
     def _draw_batch(self, stream: str = "batches") -> None:
@@ -121,10 +141,31 @@ class Sac:
             since = self._replay.newest_unit - math.ceil(self._config.replay_units)
         self._replay.sample(self._rng[stream], self._batch, since)
 
-    def _propose(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+    def _propose_both(self) -> tuple[Proposal, Proposal]:
+        """Actions of the policy at s and at s'."""
+        self._now.input.copy_(self._sampled.observation)
+        self._next.input.copy_(self._sampled.next_observation)
         self._rng["noise"].standard_normal(dtype=np.float32, out=self._noise)
-        mean, log_std = policy_heads(self._actor.leaves, observation)
-        return squashed_gaussian(mean, log_std, torch.from_numpy(self._noise))
+        drawn = propose(self._both.forward(self._actor_net)[0], torch.from_numpy(self._noise))
+        rows = self._config.batch
+        return Proposal(*(part[:rows] for part in drawn)), Proposal(*(part[rows:] for part in drawn))
+
+    def _propose_next(self) -> Proposal:
+        """Actions of the policy at s'."""
+        self._next.input.copy_(self._sampled.next_observation)
+        noise = self._noise[: self._config.batch]
+        self._rng["noise"].standard_normal(dtype=np.float32, out=noise)
+        return propose(self._next.forward(self._actor_net)[0], torch.from_numpy(noise))
+
+    def _evaluate(self, net: Mlp, observation: Tensor, action: Tensor) -> Tensor:
+        """Both critics' values, [2, B, 1]; the next pass overwrites them."""
+        self._enter(observation, action)
+        return self._values.forward(net)
+
+    def _enter(self, observation: Tensor, action: Tensor) -> None:
+        columns = self.architecture.observation_dim
+        self._values.input[:, :columns] = observation
+        self._values.input[:, columns:] = action
 
     def _temperature_step(self, log_prob: Tensor) -> None:
         """Descend on J(alpha) = -log(alpha) * mean(log pi + target entropy)."""
@@ -135,41 +176,36 @@ class Sac:
         self._log_alpha.grad[0] = -(log_prob.mean() + self._target_entropy)
         self._alpha_adam.step()
 
-    def _critic_step(self, alpha: Tensor) -> None:
+    def _critic_step(self, alpha: float, following: Proposal) -> None:
         """Descend on J(Q) = 1/2 sum_i mean (Q_i(s, a) - y)^2, y the soft target."""
-        batch = self._sampled
-        q = twin_q(self._critic.leaves, batch.observation, batch.action)
-        loss = 0.5 * (q - self._soft_target(alpha)).square().mean(-1).sum()
-        self._critic.grad.zero_()
-        torch.autograd.backward(loss)
+        target = self._soft_target(alpha, following)
+        q = self._evaluate(self._critic_net, self._sampled.observation, self._sampled.action)
+        d_q = critic_loss_to_output(q, target)
+        self._values.to_parameters(self._critic_net, d_q)
         self._critic_adam.step()
-        self._last["critic"], self._last["q"] = loss.detach(), q.detach()
+        self._critic_net.refresh()
+        self._last["d_q"], self._last["target"] = d_q, target
 
-    @torch.no_grad()
-    def _soft_target(self, alpha: Tensor) -> Tensor:
+    def _soft_target(self, alpha: float, following: Proposal) -> Tensor:
         """Soft target y = r + gamma (1 - terminated) (min_i Qtarget_i(s', a') - alpha log pi(a'|s')), [B]."""
         batch = self._sampled
-        self._rng["noise"].standard_normal(dtype=np.float32, out=self._next_noise)
-        mean, log_std = policy_heads(self._actor.frozen, batch.next_observation)
-        action, log_prob = squashed_gaussian(mean, log_std, torch.from_numpy(self._next_noise))
-        value = min_q(self._target.frozen, batch.next_observation, action) - alpha * log_prob
-        return batch.reward + self._config.gamma * value.masked_fill(batch.terminated, 0.0)
+        q = self._evaluate(self._target_net, batch.next_observation, following.action)
+        value = smaller(q) - alpha * following.log_prob
+        return batch.reward + self._config.gamma * value.masked_fill_(batch.terminated, 0.0)
 
-    def _actor_step(self, alpha: Tensor, action: Tensor, log_prob: Tensor) -> None:
+    def _actor_step(self, alpha: float, now: Proposal) -> None:
         """Descend on J(pi) = mean (alpha log pi(a|s) - Q(s, a)), a drawn from pi."""
-        value = self._policy_value(self._sampled.observation, action)
-        loss = (alpha * log_prob - value).mean()
-        self._actor.grad.zero_()
-        torch.autograd.backward(loss)
+        self._enter(self._sampled.observation, now.action)
+        value, q_to_action = self._climb()
+        d_heads = policy_loss_to_heads(now, q_to_action, alpha)
+        self._now.to_parameters(self._actor_net, d_heads[None])
         self._actor_adam.step()
-        self._last["actor"] = loss.detach()
+        self._actor_net.refresh()
+        self._last["value"], self._last["soft"] = value, alpha * now.log_prob
 
-    def _policy_value(self, observation: Tensor, action: Tensor) -> Tensor:
-        """The Q that the policy climbs, [B], differentiable in `action` alone."""
-        return self._critic_value(observation, action)
-
-    def _critic_value(self, observation: Tensor, action: Tensor) -> Tensor:
-        return min_q(self._critic.frozen, observation, action)
+    def _climb(self) -> tuple[Tensor, Tensor]:
+        """The Q that the policy climbs at (s, a) of the pass, [B], and its gradient in a, [B, A]."""
+        return climb(self._values, self._critic_net, self.architecture.action_dim)
 
     def begin_window(self, window: Window, unit: int) -> None:
         """SAC makes no forecast."""
@@ -189,17 +225,19 @@ class Sac:
         loss/critic, loss/actor, loss/alpha: J(Q), J(pi), J(alpha) above; alpha: the temperature
         now; entropy: mean -log pi on the batch; q_mean: mean over batch and critics of Q(s, a).
         """
-        last, found = self._last, {}
-        for name in ("critic", "actor"):
-            if name in last:
-                found[f"loss/{name}"] = last[name].item()
+        last: dict[str, Tensor] = self._last
+        found: dict[str, float] = {}
+        if "d_q" in last:
+            error = last["d_q"] * self._config.batch
+            found["loss/critic"] = 0.5 * error.square().mean(1).sum().item()
+            found["q_mean"] = (error + last["target"][:, None]).mean().item()
+        if "value" in last:
+            found["loss/actor"] = (last["soft"] - last["value"]).mean().item()
         if "log_prob" in last:
             found["entropy"] = -last["log_prob"].mean().item()
         if "log_alpha" in last:
             found["loss/alpha"] = last["log_alpha"].item() * (found["entropy"] - self._target_entropy)
-        if "q" in last:
-            found["q_mean"] = last["q"].mean().item()
-        found["alpha"] = self._log_alpha.flat[0].exp().item() if self._tuned else self._fixed_alpha.item()
+        found["alpha"] = self._log_alpha.flat[0].exp().item() if self._tuned else self._fixed_alpha
         return found
 
     # -- durability
@@ -232,6 +270,8 @@ class Sac:
         self.gradient_steps = int(state.scalars["gradient_steps"])
         self.policy_steps = int(state.scalars["policy_steps"])
         self._last = {}
+        for net in (self._actor_net, self._critic_net, self._target_net):
+            net.refresh()
 
     def _expected_tensors(self, state: State) -> dict[str, NDArray[Any]]:  # noqa: ARG002 (for subclasses)
         """The tensors that `state`, going by its scalars, should have."""
@@ -239,24 +279,16 @@ class Sac:
 
     def _durable(self) -> dict[str, Tensor]:
         """The tensors that a checkpoint keeps, by name: views, so that `load` writes through them."""
-        trained = {"actor": (self._actor, self._actor_adam), "critic": (self._critic, self._critic_adam)}
-        if self._tuned:
-            trained["temperature"] = (self._log_alpha, self._alpha_adam)
         durable = {f"target.{name}": view for name, view in self._target.views(self._target.flat).items()}
-        for network, (parameters, optimiser) in trained.items():
+        for network, (parameters, optimiser) in self._trained().items():
             buffers = {"": parameters.flat, "adam.m.": optimiser.moment1, "adam.v.": optimiser.moment2}
             for kind, buffer in buffers.items():
                 durable |= {f"{network}.{kind}{n}": view for n, view in parameters.views(buffer).items()}
             durable[f"{network}.adam.steps"] = optimiser.steps
         return durable
 
-
-class _Tensors:
-    """The arrays of a batch as tensors that share their memory."""
-
-    def __init__(self, batch: Batch) -> None:
-        self.observation = torch.from_numpy(batch.observation)
-        self.action = torch.from_numpy(batch.action)
-        self.reward = torch.from_numpy(batch.reward)
-        self.next_observation = torch.from_numpy(batch.next_observation)
-        self.terminated = torch.from_numpy(batch.terminated)
+    def _trained(self) -> dict[str, tuple[FlatParameters, Adam]]:
+        trained = {"actor": (self._actor, self._actor_adam), "critic": (self._critic, self._critic_adam)}
+        if self._tuned:
+            trained["temperature"] = (self._log_alpha, self._alpha_adam)
+        return trained

@@ -108,7 +108,7 @@ class LearnerConfig:
     replay_capacity: int = 1_000_000  # transitions
     replay_units: float | None = None  # sample only the newest units; None: all
     threads: int = 1
-    precision: Precision = "float32"  # of the networks' products; parameters are float32 in any case
+    precision: Precision = "auto"  # of the networks' products, "auto": bfloat16 where the processor has it
     governor: Literal["on", "off"] = "on"  # give way to the agent before deadlines are missed
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     forecast: ForecastConfig = field(default_factory=ForecastConfig)

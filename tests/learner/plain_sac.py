@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -25,20 +26,12 @@ class PlainSac:
         for name, rng in self.rng.items():
             rng.bit_generator.state = state.scalars["rng"][name]
         widths = [OBSERVATION_DIM, *config.hidden]
-        last = len(config.hidden)
         self.actor = network([*widths, 2 * ACTION_DIM])
-        names = [f"trunk.{index}" for index in range(last)] + ["heads"]
-        for layer, name in zip(linears(self.actor), names, strict=True):
-            layer.weight.data = torch.tensor(tensors[f"actor.{name}.weight"])
-            layer.bias.data = torch.tensor(tensors[f"actor.{name}.bias"])
+        load(self.actor, tensors, "actor", 0)
         self.critics = []
         for twin in range(2):
-            critic = network([OBSERVATION_DIM + ACTION_DIM, *config.hidden, 1])
-            for index, layer in enumerate(linears(critic)):
-                weight = torch.tensor(tensors[f"critic.{index}.weight"][twin])
-                layer.weight.data = weight if index == last else weight.T.contiguous()
-                layer.bias.data = torch.tensor(tensors[f"critic.{index}.bias"][twin].reshape(-1))
-            self.critics.append(critic)
+            self.critics.append(network([OBSERVATION_DIM + ACTION_DIM, *config.hidden, 1]))
+            load(self.critics[-1], tensors, "critic", twin)
         self.targets = copy.deepcopy(self.critics)
         self.log_alpha = torch.zeros(1, requires_grad=True)
         self.actor_adam = torch.optim.Adam(self.actor.parameters(), lr=config.actor_lr)
@@ -93,6 +86,13 @@ class PlainSac:
 def q(critics: list[nn.Sequential], index: int, observation: Tensor, action: Tensor) -> Tensor:
     value: Tensor = critics[index](torch.cat((observation, action), 1))[:, 0]
     return value
+
+
+def load(model: nn.Sequential, tensors: dict[str, NDArray[np.float32]], name: str, index: int) -> None:
+    """Take the parameters of network `index` of those side by side under `name`."""
+    for layer, linear in enumerate(linears(model)):
+        linear.weight.data = torch.tensor(tensors[f"{name}.{layer}.weight"][index].T.copy())
+        linear.bias.data = torch.tensor(tensors[f"{name}.{layer}.bias"][index, 0])
 
 
 def descend(loss: Tensor, optimiser: torch.optim.Optimizer) -> None:

@@ -87,12 +87,14 @@ def test_another_schema_is_refused(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, state())
     path = tmp_path / checkpoint.MANIFEST
     path.write_text(json.dumps(json.loads(path.read_text()) | {"schema": 9}))
-    with pytest.raises(CheckpointError, match=r"schema 9 \(wanted 1\)"):
+    with pytest.raises(CheckpointError, match=r"schema 9 \(wanted 2\)"):
         checkpoint.load(tmp_path)
 
 
 CONFIGS = {
     "sac": small_config(),
+    "sac, bfloat16": small_config(precision="bfloat16"),
+    "fsac, distilled": small_config(algo="fsac", forecast=forq(distil=True), precision="bfloat16"),
     "sac, fixed temperature": small_config(alpha=0.2),
     "fsac": small_config(algo="fsac", forecast=forq()),
     "fsac, recent replay": small_config(algo="fsac", forecast=forq(l_p=2, shrink=1.0), replay_units=3.0),
@@ -148,7 +150,7 @@ def test_every_difference_is_listed_and_nothing_changes() -> None:
         "algo 'fsac' (wanted 'sac')",
         "hidden [8, 16] (wanted [16, 16])",
         "critic.0.weight float32[2, 5, 8] (wanted float32[2, 5, 16])",
-        "actor.adam.m.trunk.0.bias float32[8] (wanted float32[16])",
+        "actor.adam.m.0.bias float32[1, 1, 8] (wanted float32[1, 1, 16])",
         "temperature.log_alpha missing (wanted float32[1])",
     ):
         assert difference in text

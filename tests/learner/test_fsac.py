@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from learner.distil import FIRST_FITS
 from learner.fsac import Fsac
 from learner.sac import Sac
 from rtcore.config import LearnerConfig
 from rtcore.windows import Window
+from tests.learner import formulas
+from tests.learner.formulas import critic_value
 from tests.learner.small import ACTION_DIM, OBSERVATION_DIM, filled_replay, forq, small_config
 
 UPDATES_PER_UNIT = 4
@@ -35,9 +38,20 @@ def in_second_window(config: LearnerConfig | None = None) -> Fsac:
 
 
 def probe() -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.linspace(-1, 1, 30).view(10, OBSERVATION_DIM), torch.linspace(-0.9, 0.9, 20).view(
-        10, ACTION_DIM
-    )
+    """A batch of observations and actions."""
+    rows = small_config().batch
+    observation = torch.linspace(-1, 1, rows * OBSERVATION_DIM).view(rows, OBSERVATION_DIM)
+    return observation, torch.linspace(-0.9, 0.9, rows * ACTION_DIM).view(rows, ACTION_DIM)
+
+
+def climbed(fsac: Fsac) -> torch.Tensor:
+    """The Q that the policy climbs, at the probe."""
+    fsac._enter(*probe())
+    return fsac._climb()[0]
+
+
+def live_value(fsac: Fsac) -> torch.Tensor:
+    return critic_value(fsac._critic, *probe())
 
 
 def same_bits(first: Sac, second: Sac, prefix: str = "") -> bool:
@@ -91,11 +105,11 @@ def test_true_copies_do_not_move_when_the_critic_trains() -> None:
     fsac = make_fsac()
     learn_units(fsac, range(1))
     (copy,) = fsac._history.snapshots
-    at_end = copy.value(*probe()).clone()
-    torch.testing.assert_close(at_end, fsac._critic_value(*probe()), rtol=0, atol=0)
+    at_end = critic_value(copy.parameters, *probe())
+    torch.testing.assert_close(at_end, live_value(fsac), rtol=0, atol=0)
     learn_units(fsac, range(1, 3))
-    assert torch.equal(copy.value(*probe()), at_end)
-    assert not torch.equal(fsac._critic_value(*probe()), at_end)
+    assert torch.equal(critic_value(copy.parameters, *probe()), at_end)
+    assert not torch.equal(live_value(fsac), at_end)
 
 
 def test_the_policy_climbs_the_weighted_sum_of_the_copies() -> None:
@@ -103,9 +117,11 @@ def test_the_policy_climbs_the_weighted_sum_of_the_copies() -> None:
     # times -2, -1, 0 and t_q = 4, the window's length: 1/3 + (4 + 1) * (-1, 0, 1) / 2
     weights = [1 / 3 - 2.5, 1 / 3, 1 / 3 + 2.5]
     assert times(fsac) == [2, 3, 4]
-    values = torch.stack([snapshot.value(*probe()) for snapshot in fsac._history.snapshots])
+    values = torch.stack(
+        [critic_value(snapshot.parameters, *probe()) for snapshot in fsac._history.snapshots]
+    )
     wanted = (torch.tensor(weights)[:, None] * values).sum(0)
-    torch.testing.assert_close(fsac._policy_value(*probe()), wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(climbed(fsac), wanted, rtol=1e-5, atol=1e-5)
     seen = fsac.metrics()
     assert seen["forecast/weight_norm"] == pytest.approx(float(np.linalg.norm(weights)))
     assert (seen["forecast/horizon"], seen["forecast/snapshots"]) == (4.0, 3.0)
@@ -117,32 +133,38 @@ def test_the_actor_descends_on_the_forecast_loss() -> None:
     fsac.update(improve_policy=True)
     twin._draw_batch()
     alpha, observation = twin.metrics()["alpha"], twin._sampled.observation
-    action, log_prob = twin._propose(observation)
-    past = [snapshot.value(observation, action) for snapshot in twin._history.snapshots]
+    now, _ = twin._propose_both()
+    leaves = {
+        name: view.clone().requires_grad_() for name, view in twin._actor.views(twin._actor.flat).items()
+    }
+    noise = torch.from_numpy(twin._noise[: len(observation)])
+    action, log_prob = formulas.squashed_gaussian(formulas.mlp(leaves, observation)[0], noise)
+    torch.testing.assert_close(action, now.action)
+    past = [critic_value(snapshot.parameters, observation, action) for snapshot in twin._history.snapshots]
     value = -13 / 6 * past[0] + 1 / 3 * past[1] + 17 / 6 * past[2]  # weights as above
     loss = (alpha * log_prob - value).mean()
     assert fsac.metrics()["loss/actor"] == pytest.approx(loss.item(), rel=1e-4)
-    wanted = torch.autograd.grad(loss, twin._actor.leaves)
+    wanted = torch.autograd.grad(loss, list(leaves.values()))
     for found, gradient in zip(fsac._actor.views(fsac._actor.grad).values(), wanted, strict=True):
         torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-5)
 
 
 def test_the_forecast_stays_while_the_window_lasts() -> None:
     fsac = in_second_window()
-    before = fsac._policy_value(*probe())
+    before = climbed(fsac)
     learn_units(fsac, range(4, 7))
     fsac.begin_window(WINDOW_1, 6)  # entered again, after a restart
-    assert torch.equal(fsac._policy_value(*probe()), before)
+    assert torch.equal(climbed(fsac), before)
     learn_units(fsac, range(7, 8))
     fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 8)
-    assert not torch.equal(fsac._policy_value(*probe()), before)
+    assert not torch.equal(climbed(fsac), before)
 
 
 def test_it_uses_the_snapshots_there_are() -> None:
     fsac = make_fsac(small_config(algo="fsac", forecast=forq(l_p=10)))
     fsac.begin_window(WINDOW_0, 0)
     assert fsac.metrics()["forecast/snapshots"] == 0
-    torch.testing.assert_close(fsac._policy_value(*probe()), fsac._critic_value(*probe()), rtol=0, atol=0)
+    torch.testing.assert_close(climbed(fsac), live_value(fsac))
     learn_units(fsac, range(2))
     fsac.begin_window(WINDOW_1, 4)
     assert fsac.metrics()["forecast/snapshots"] == 2
@@ -186,7 +208,7 @@ def test_a_forecast_is_judged_by_the_critic_reached() -> None:
         set_constant_critic(fsac, value)
         fsac.end_unit(unit)
     fsac.begin_window(WINDOW_1, 4)  # a line through 1, 2: Qtilde = 6 at t = 8
-    assert fsac._policy_value(*probe()).tolist() == pytest.approx([6.0] * 10, abs=1e-5)
+    assert climbed(fsac).tolist() == pytest.approx([6.0] * 32, abs=1e-5)
     set_constant_critic(fsac, 5.5)
     fsac.end_unit(7)
     fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 8)
@@ -201,3 +223,55 @@ def test_a_forecast_is_not_judged_late() -> None:
     learn_units(fsac, range(4, 9))
     fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 9)
     assert fsac.metrics()["forecast/windows"] == 0
+
+
+def test_a_distilled_forecast_takes_over_after_the_exact_steps() -> None:
+    fsac = in_second_window(small_config(algo="fsac", forecast=forq(distil=True)))
+    exact = in_second_window()
+    assert fsac._distilled is not None
+    assert torch.equal(climbed(fsac), climbed(exact))
+    fsac._distilled.steps = FIRST_FITS + 1
+    taken_over = climbed(fsac)
+    assert not torch.equal(taken_over, climbed(exact))
+    wanted = formulas.mlp(
+        fsac._distilled.parameters.views(fsac._distilled.parameters.flat), torch.cat(probe(), -1)
+    )
+    torch.testing.assert_close(taken_over, wanted[0, :, 0])
+    assert {"forecast/distil_error", "forecast/distil_slope"} <= fsac.metrics().keys()
+
+
+def test_distilling_needs_no_random_numbers_and_leaves_the_critics_alone() -> None:
+    distilled = in_second_window(small_config(algo="fsac", forecast=forq(distil=True)))
+    exact = in_second_window()
+    assert distilled._distilled is not None
+    distilled._distilled.steps = FIRST_FITS + 1
+    for student in (distilled, exact):
+        student.update(improve_policy=True)
+    assert same_bits(exact, distilled, "critic.")
+    assert not same_bits(exact, distilled, "actor.")
+    assert exact.state().scalars["rng"] == distilled.state().scalars["rng"]
+
+
+def test_a_new_window_begins_a_new_fit() -> None:
+    fsac = in_second_window(small_config(algo="fsac", forecast=forq(distil=True)))
+    learn_units(fsac, range(4, 8))
+    assert fsac._distilled is not None
+    assert fsac._distilled.steps == 4 * UPDATES_PER_UNIT
+    fsac.begin_window(Window(m=2, start=8, update=3, hold=1), 8)
+    assert fsac._distilled.steps == 0
+    assert "forecast/distil_error" not in fsac.metrics()
+
+
+def test_a_distilled_forecast_outlives_the_process() -> None:
+    config = small_config(algo="fsac", forecast=forq(distil=True), precision="bfloat16")
+    before, after = in_second_window(config), make_fsac(config, seed=8)
+    learn_units(before, range(4, 5))
+    assert before._distilled is not None
+    assert after._distilled is not None
+    before._distilled.steps = FIRST_FITS + 1
+    after.load(before.state())
+    assert after._distilled.steps == FIRST_FITS + 1
+    assert torch.equal(climbed(after), climbed(before))
+    for student in (before, after):
+        learn_units(student, range(5, 12))  # with exact steps among them
+    assert same_bits(before, after)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from learner.algorithm import make_algorithm
+from learner.arithmetic import product_type
 from learner.replay import Replay
 from learner.sac import Sac
 from rtcore.config import LearnerConfig
@@ -33,13 +34,13 @@ def test_it_is_plain_sac(alpha: float | str) -> None:
         seen = sac.metrics()
         assert {name: seen[name] for name in plain.losses} == pytest.approx(plain.losses, rel=1e-4, abs=1e-5)
     tensors = sac.state().tensors
-    for index, name in enumerate(["trunk.0", "trunk.1", "heads"]):
-        wanted = linears(plain.actor)[index].weight.detach().numpy()
-        np.testing.assert_allclose(tensors[f"actor.{name}.weight"], wanted, rtol=1e-3, atol=1e-5)
-    for network, models in (("critic", plain.critics), ("target", plain.targets)):
+    trained = {"actor": [plain.actor], "critic": plain.critics, "target": plain.targets}
+    for network, models in trained.items():
         for twin, model in enumerate(models):
-            wanted = linears(model)[1].weight.detach().numpy().T
-            np.testing.assert_allclose(tensors[f"{network}.1.weight"][twin], wanted, rtol=1e-3, atol=1e-5)
+            for layer, linear in enumerate(linears(model)):
+                for kind, wanted in (("weight", linear.weight.T), ("bias", linear.bias)):
+                    found = tensors[f"{network}.{layer}.{kind}"][twin].reshape(wanted.shape)
+                    np.testing.assert_allclose(found, wanted.detach().numpy(), rtol=1e-3, atol=1e-5)
     assert sac.metrics()["alpha"] == pytest.approx(
         plain.log_alpha.exp().item() if alpha == "auto" else 0.3, rel=1e-5
     )
@@ -64,8 +65,10 @@ def test_a_pause_does_not_change_which_batches_come() -> None:
     assert paused.state().scalars["rng"]["batches"] == going.state().scalars["rng"]["batches"]
 
 
-def test_equal_seeds_give_equal_bits_and_others_do_not() -> None:
-    first, second, other = make_sac(seed=3), make_sac(seed=3), make_sac(seed=4)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_equal_seeds_give_equal_bits_and_others_do_not(precision: str) -> None:
+    config = small_config(precision=precision)
+    first, second, other = (make_sac(config, seed=seed) for seed in (3, 3, 4))
     assert first.policy_arrays()["mean.weight"].tobytes() != other.policy_arrays()["mean.weight"].tobytes()
     for sac in (first, second, other):
         train(sac, 20)
@@ -133,9 +136,40 @@ def mean_reward(sac: Sac, replay: Replay, rng: np.random.Generator, rounds: int)
     return total / rounds
 
 
-@pytest.mark.parametrize("algo", ["sac", "fsac"])
-def test_it_learns(algo: str) -> None:
-    config = small_config(algo=algo, alpha=0.01, actor_lr=5e-3, critic_lr=5e-3, hidden=(32, 32), batch=64)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_the_products_precision(precision: str) -> None:
+    sac = make_sac(small_config(precision=precision))
+    train(sac, 3)
+    assert str(sac._critic_net.weights[0].dtype) == f"torch.{precision}"
+    assert {str(array.dtype) for array in sac.state().tensors.values()} == {"float32"}
+
+
+def test_bfloat16_learns_what_float32_does() -> None:
+    exact, rounded = make_sac(), make_sac(small_config(precision="bfloat16"))
+    train(exact, 30)
+    train(rounded, 30)
+    assert rounded.metrics() == pytest.approx(exact.metrics(), rel=0.03, abs=0.01)
+    assert rounded.metrics() != exact.metrics()
+
+
+@pytest.mark.parametrize(
+    ("has", "wanted"),
+    [({"avx512_bf16": True}, "bfloat16"), ({"amx_bf16": True}, "bfloat16"), ({"avx2": True}, "float32")],
+)
+def test_auto_asks_the_processor(has: dict[str, bool], wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cpu.get_capabilities", lambda: has)
+    assert str(product_type("auto")) == f"torch.{wanted}"
+    assert str(product_type("bfloat16")) == "torch.bfloat16"
+    assert str(product_type("float32")) == "torch.float32"
+
+
+@pytest.mark.parametrize(
+    ("algo", "precision"), [("sac", "float32"), ("sac", "bfloat16"), ("fsac", "float32")]
+)
+def test_it_learns(algo: str, precision: str) -> None:
+    config = small_config(
+        algo=algo, precision=precision, alpha=0.01, actor_lr=5e-3, critic_lr=5e-3, hidden=(32, 32), batch=64
+    )
     rng, replay = np.random.default_rng(0), Replay(5000, 1, 1)
     student = make_algorithm(config, 1, 1, 0, replay)
     assert isinstance(student, Sac)
