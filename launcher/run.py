@@ -19,7 +19,7 @@ from launcher.summary import Summary, summarise
 from launcher.supervisor import End, Interrupts, Supervisor, command_for
 from launcher.viewer import Viewer
 from launcher.watch import Watch
-from rtcore import channels
+from rtcore import channels, realtime
 from rtcore.bus import Bus, BusError
 from rtcore.config import RunConfig
 from rtcore.monotonic import MonotonicClock
@@ -87,6 +87,7 @@ def _carry_out(
     with interrupts.counted(), supervisor.started():
         os.nice(NICENESS)
         with (
+            realtime.out_of_the_way(config.agent.rt),
             open_bus("client", run_dir.run_name, run_dir.socket_dir(), clock=clock) as bus,
             closing(viewer),
             screen.shown(),

@@ -13,7 +13,7 @@ import gc
 import os
 import resource
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -133,6 +133,26 @@ def step_back() -> None:
     if hasattr(os, "sched_setscheduler"):
         with contextlib.suppress(OSError):  # SCHED_IDLE, say, may not be left; it delays no tick either
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+@contextlib.contextmanager
+def out_of_the_way(rt: Rt) -> Iterator[None]:
+    """Keep a process that only watches off the acting pair's core, if there is another, inside the block.
+
+    Enter it once the processes that are watched have been started: they would inherit it.
+    """
+    allowed = allowed_cores()
+    others = allowed[1:]
+    if rt == "off" or not others:
+        yield
+        return
+    with contextlib.suppress(OSError, AttributeError):  # refused: then it shares the core
+        pin(others)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError, AttributeError):
+            pin(allowed)
 
 
 def plan(role: str, rt: Rt, allowed: Sequence[int], granted: Privileges) -> Plan:

@@ -248,3 +248,13 @@ resource.getrlimit = lambda kind: ({limit}, {limit})
 print(json.dumps(dataclasses.asdict(realtime.privileges())))
 """)
     assert granted == {"max_priority": expected, "lock_memory": expected == 99}
+
+
+@pytest.mark.skipif(len(realtime.allowed_cores()) < 2, reason="needs a second core")
+def test_who_only_watches_keeps_off_the_first_core_and_comes_back() -> None:
+    allowed = realtime.allowed_cores()
+    with realtime.out_of_the_way("off"):
+        assert realtime.allowed_cores() == allowed
+    with realtime.out_of_the_way("auto"):
+        assert realtime.allowed_cores() == allowed[1:]
+    assert realtime.allowed_cores() == allowed
