@@ -14,6 +14,9 @@ class Clock(Protocol):
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Return at or after `deadline_ns`; at once if it has passed."""
 
+    def rest_until_ns(self, deadline_ns: int) -> None:
+        """Like `sleep_until_ns`, for what need not be exact: leaves the core to others until the end."""
+
 
 class VirtualClock:
     """A clock that moves only when told to, or when somebody sleeps on it.
@@ -31,6 +34,10 @@ class VirtualClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Move to `deadline_ns`, never backwards."""
         self._now_ns = max(self._now_ns, deadline_ns)
+
+    def rest_until_ns(self, deadline_ns: int) -> None:
+        """The same as `sleep_until_ns`."""
+        self.sleep_until_ns(deadline_ns)
 
     def advance_ns(self, duration_ns: int) -> None:
         """Let `duration_ns` pass, as work would."""

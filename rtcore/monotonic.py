@@ -30,8 +30,11 @@ class MonotonicClock:
         """
         remaining_ns = deadline_ns - time.monotonic_ns()
         tail_ns = LONG_TAIL_NS if remaining_ns >= LONG_SLEEP_NS else SHORT_TAIL_NS
-        wake_ns = deadline_ns - tail_ns
-        while time.monotonic_ns() < wake_ns:
-            libc.sleep_until_ns(wake_ns)
+        self.rest_until_ns(deadline_ns - tail_ns)
         while time.monotonic_ns() < deadline_ns:
             pass
+
+    def rest_until_ns(self, deadline_ns: int) -> None:
+        """Return 30 to 120 us after `deadline_ns`; signal handlers run meanwhile, and the wait then goes on."""
+        while time.monotonic_ns() < deadline_ns:
+            libc.sleep_until_ns(deadline_ns)

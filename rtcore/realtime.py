@@ -26,6 +26,7 @@ Rt = Literal["auto", "off", "require"]
 Collector = Literal["frozen", "on"]
 
 FIFO_PRIORITY = 50  # the measured one: above ordinary threads, level with the kernel's interrupt threads
+BACKGROUND_PRIORITY = 1  # of the threads beside those that act
 TIMER_SLACK_NS = 1  # the default of 50 us is added to every sleep: p50 83 -> 43 us without it
 NICE = {LEARNER: 5, RECORDER: 10}  # ranks only within one session (autogroup): start all from one launcher
 # How long a thread that acts waits, at most, for the interpreter while another one computes; Python's 5 ms
@@ -125,14 +126,15 @@ def enter(role: str, rt: Rt) -> Placement:
 
 
 def step_back() -> None:
-    """Give the calling thread ordinary scheduling, whatever the process has; its core stays.
+    """Put the calling thread behind those that act: lowest SCHED_FIFO priority where the process has SCHED_FIFO.
 
-    For work beside the ticks: under SCHED_FIFO a thread of the same priority is not preempted, so a
-    hash or an encoding of a millisecond would delay a tick by as much.
+    For work beside the ticks: at the same priority a thread is not preempted, so a hash of a millisecond
+    would delay a tick by as much. With ordinary scheduling it is preempted by anybody on the core, for
+    milliseconds, and may hold the interpreter meanwhile, which a tick then waits for.
     """
-    if hasattr(os, "sched_setscheduler"):
-        with contextlib.suppress(OSError):  # SCHED_IDLE, say, may not be left; it delays no tick either
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    if hasattr(os, "sched_setscheduler") and os.sched_getscheduler(0) == os.SCHED_FIFO:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(BACKGROUND_PRIORITY))
 
 
 @contextlib.contextmanager
