@@ -35,6 +35,6 @@ class MonotonicClock:
             pass
 
     def rest_until_ns(self, deadline_ns: int) -> None:
-        """Return 30 to 120 us after `deadline_ns`; signal handlers run meanwhile, and the wait then goes on."""
+        """Return 30 to 120 us after `deadline_ns`, whatever signals come meanwhile."""
         while time.monotonic_ns() < deadline_ns:
             libc.sleep_until_ns(deadline_ns)

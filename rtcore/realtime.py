@@ -126,7 +126,7 @@ def enter(role: str, rt: Rt) -> Placement:
 
 
 def step_back() -> None:
-    """Put the calling thread behind those that act: lowest SCHED_FIFO priority where the process has SCHED_FIFO.
+    """Put the calling thread behind those that act: SCHED_FIFO too, where they have it, but lowest.
 
     For work beside the ticks: at the same priority a thread is not preempted, so a hash of a millisecond
     would delay a tick by as much. With ordinary scheduling it is preempted by anybody on the core, for

@@ -13,8 +13,8 @@ OBSERVATION_DIM, ACTION_DIM = 3, 2
 
 
 def small_config(**fields: Any) -> LearnerConfig:
-    """Nets of 16 x 16, batches of 32; `fields` override."""
-    defaults: dict[str, Any] = {"hidden": (16, 16), "batch": 32, "algo": "sac"}
+    """Nets of 16 x 16, batches of 32, products that formulas can be held against; `fields` override."""
+    defaults: dict[str, Any] = {"hidden": (16, 16), "batch": 32, "algo": "sac", "precision": "float32"}
     return LearnerConfig(**(defaults | fields))
 
 
