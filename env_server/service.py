@@ -98,6 +98,7 @@ class EnvService:
         self._steps = bus.publisher(channels.STEP, env.name)
         self._actions = bus.queue(channels.ACTION, env.name, capacity=ACTIONS_KEPT)
         self.journal = Journal(bus.publisher(channels.LOG, env.name), clock, ledger)
+        self._heard: list[Received[Action]] = []
         self._accounts = Accounts(ledger)
         self._rehearsal = Rehearsal(self._steps, clock, self._tick_ns)
         self._blame = Blame(self._tick_ns, resumed_ns)
@@ -122,7 +123,7 @@ class EnvService:
         for tick in self.pacer.ticks(stop):
             entry = self.act(tick)
             # The agent has the core until its answer is there; the books can wait.
-            answered = self._actions.wait(rest_s)
+            answered = self._await_answer(tick.index, rest_s)
             self.book(entry)
             if answered and not stop.is_set():
                 self._rehearsal.perform(entry.step)
@@ -216,7 +217,24 @@ class EnvService:
         self._log(self._blame.finish())
         self.journal.close()
 
+    def _await_answer(self, tick: int, timeout_s: float) -> bool:
+        """Wait for the answer to observation `tick`, or for the time to pass; what comes is kept for the next
+        deadline. A rehearsal's answer that comes late does not count: it would send the next rehearsal, and
+        the books, in front of the real answer, tick after tick."""
+        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while not any(received.message.tick == tick for received in self._heard):
+            remaining_ns = until_ns - self._clock.now_ns()
+            if remaining_ns <= 0 or not self._actions.wait(remaining_ns / 1e9):
+                return False
+            self._heard += self._drain()
+        return True
+
     def _listen(self) -> list[Received[Action]]:
+        """Everything that came and was not dealt with."""
+        heard, self._heard = [*self._heard, *self._drain()], []
+        return heard
+
+    def _drain(self) -> list[Received[Action]]:
         return [received for received in self._actions.drain() if not received.message.rehearsal]
 
     def _hear(self, heard: Sequence[Received[Action]], tick: int) -> None:

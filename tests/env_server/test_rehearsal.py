@@ -8,6 +8,7 @@ import pytest
 from env_server.rehearsal import Rehearsal
 from rtcore import channels
 from rtcore.clock import VirtualClock
+from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Step
 from tests.env_server.rig import Rig, run_config
@@ -56,3 +57,20 @@ def test_the_answer_to_a_rehearsal_neither_acts_nor_hides_the_one_that_does() ->
     steps = rehearsed.run(answer_and_rehearse)
     assert steps == plain.run()
     assert rehearsed.counts("missed", "action.stale", "action.invalid") == [0, 0, 0]
+
+
+def test_only_the_real_answer_is_waited_for_and_it_is_kept_for_the_deadline() -> None:
+    rig = Rig(run_config(duration_s=0.05))
+    rig.service.announce()
+    first, second = list(rig.service.pacer.ticks(Stop()))[:2]
+    rig.service.act(first)
+    observed = rig.agent.newest()
+    rig.agent.answer(observed, rehearsal=True)
+    before_ns = rig.clock.now_ns()
+    assert not rig.service._await_answer(first.index, 0.004)
+    assert rig.clock.now_ns() == before_ns + 4_000_000  # the rehearsal's answer did not end the wait
+    rig.agent.answer(observed)
+    assert rig.service._await_answer(first.index, 0.004)
+    rig.service.act(second)
+    assert not rig.service._heard
+    assert rig.agent.newest().answered_tick == first.index
