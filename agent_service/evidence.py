@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
+RECENT_NS = 100_000_000
 SCHEDSTAT_BYTES = 64  # time on a core, time waiting for one in ns, number of turns: three integers
 
 
@@ -60,17 +61,21 @@ class CoreWaits:
     def __init__(self) -> None:
         self._files: dict[int, int] = {}  # by thread; -1: not Linux, or a kernel without the counters
         self._last_ns: dict[int, int] = {}
+        self._read_at_ns: dict[int, int] = {}
         self._total_ns = 0
 
-    def read_ns(self) -> int:
-        """The total so far, what the calling thread waited since its last call included."""
+    def read_ns(self, now_ns: int) -> int:
+        """The total so far, what the calling thread waited since its last call included, if that was within
+        the last 100 ms: what a thread waited for while others acted is nobody's excuse.
+        """
         thread = threading.get_native_id()
         if thread not in self._files:
             self._files[thread] = _open_schedstat(thread)
             self._last_ns[thread] = _waited_ns(self._files[thread])  # before it acted: of no interest
         waited_ns = _waited_ns(self._files[thread])
-        self._total_ns += waited_ns - self._last_ns[thread]
-        self._last_ns[thread] = waited_ns
+        if now_ns - self._read_at_ns.get(thread, 0) <= RECENT_NS:
+            self._total_ns += waited_ns - self._last_ns[thread]
+        self._last_ns[thread], self._read_at_ns[thread] = waited_ns, now_ns
         return self._total_ns
 
     def close(self) -> None:
@@ -127,7 +132,7 @@ class Evidence:
             self._since_ns = received_ns
         swapped_ns, checked_ns = self.swapping.read_ns(now_ns), self.checking.read_ns(now_ns)
         collected_ns = self._collecting.read_ns(now_ns)
-        starved_ns = self._waits.read_ns() if self._gathered else 0
+        starved_ns = self._waits.read_ns(now_ns) if self._gathered else 0
         excuse = Excuse(
             max(0, swapped_ns - self._swapped_ns + checked_ns - self._checked_ns),
             max(0, collected_ns - self._collected_ns),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 OLD_TICKS = 2  # older than this on arrival, an observation's answer is late whatever the agent does
+OLD_IN_A_ROW = 256  # a backlog of a quarter of a second at 1 kHz; beyond it the stamps are not believed
 MEMORY = 1000  # observations over which the shortest way is remembered
 
 
@@ -20,6 +21,7 @@ class Freshness:
         self._shortest_ns: int | None = None
         self._next_shortest_ns: int | None = None  # of the 1000 under way
         self._seen = 0
+        self._in_a_row = 0
 
     def is_old(self, sent_ns: int, received_ns: int) -> bool:
         """Whether the observation waited for more than two ticks longer than others do."""
@@ -31,4 +33,8 @@ class Freshness:
         self._seen += 1
         if self._seen == MEMORY:
             self._shortest_ns, self._next_shortest_ns, self._seen = self._next_shortest_ns, None, 0
-        return way_ns - self._shortest_ns > self._limit_ns
+        old = way_ns - self._shortest_ns > self._limit_ns
+        self._in_a_row = self._in_a_row + 1 if old else 0
+        if self._in_a_row == OLD_IN_A_ROW:  # no backlog is as long: a clock was set
+            self._shortest_ns = self._next_shortest_ns = way_ns
+        return old

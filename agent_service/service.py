@@ -20,7 +20,7 @@ from rtcore.messages import Action, Command, CommandReply, Policy, Spec, Step
 
 WAIT_S = 0.2  # how long a wait may last before `stop`, or a failure, is looked at
 AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's
-REHEARSAL_STREAM = 3  # and these from those that act
+REHEARSAL_STREAM = 3  # of rehearsals
 
 
 class AgentService:
@@ -54,6 +54,7 @@ class AgentService:
         self._actions = bus.publisher(channels.ACTION, name)
         self._acting = threading.Lock()  # two links may deliver at once while one replaces the other
         self._failure: Exception | None = None
+        self._closed = False
         self._evidence = evidence or Evidence(clock.now_ns)
         self._spec: Spec | None = None
         self._freshness = Freshness(0)
@@ -66,8 +67,13 @@ class AgentService:
         """Act until stopped. What acting failed with is raised here."""
         self.attend()
         while not stop.wait(WAIT_S):
-            if self._failure is not None:
-                raise self._failure
+            self.check()
+        self.check()
+
+    def check(self) -> None:
+        """Raise what acting has failed with, if it has: nothing may be raised into the bus."""
+        if self._failure is not None:
+            raise self._failure
 
     def attend(self) -> None:
         """Answer every observation from now on, on the thread that receives it."""
@@ -78,16 +84,19 @@ class AgentService:
         while not stop.is_set():
             if self._adoption is None:
                 stop.wait(0.01)
-            elif self._policies.wait(WAIT_S):
-                self.poll_policies()
+                continue
+            self.poll_policies()
+            self._policies.wait(WAIT_S)
 
     def poll_policies(self) -> None:
         """Check the policies that have arrived. Does nothing before the environment is known."""
         if self._adoption is None:
             return
-        for received in self._policies.drain():
+        last_published, self._last_published = self._last_published, None
+        policies = [received.message for received in self._policies.drain()]
+        for policy in policies if last_published is None else [last_published, *policies]:
             self._evidence.checking.start()
-            self._adoption.offer(received.message, self._clock.now_ns())
+            self._adoption.offer(policy, self._clock.now_ns())
             self._evidence.checking.stop()
 
     def act(self, received: Received[Step]) -> None:
@@ -149,18 +158,20 @@ class AgentService:
 
     def close(self) -> None:
         """Account for a policy that was ready and never acted."""
-        if self._adoption is not None and self._adoption.take() is not None:
-            self._ledger.count("policies.unused")
+        with self._acting:  # the bus still delivers: nothing is adopted after the count
+            self._closed = True
+            if self._adoption is not None and self._adoption.take() is not None:
+                self._ledger.count("policies.unused")
 
     def _answer(self, received: Received[Step]) -> None:
-        if self._failure is not None:
-            return
         if not self._acting.acquire(blocking=False):
+            self._ledger.count("observations")
             self._ledger.count("observations.superseded")
             return
         try:
-            self.act(received)
-        except Exception as error:  # noqa: BLE001 - nothing may be raised into the bus; `run` raises it
+            if self._failure is None and not self._closed:
+                self.act(received)
+        except Exception as error:  # noqa: BLE001 - nothing may be raised into the bus; `check` raises it
             self._failure = error
         finally:
             self._acting.release()
@@ -178,7 +189,7 @@ class AgentService:
         self._ledger.gauge("policy_version", policy.version)
         self._ledger.event(
             now_ns, "DEBUG", f"policy {policy.version} (window {policy.window}, iterate {policy.iterate}) "
-            f"acts from tick {step.tick + 1}"
+            f"acts after tick {step.tick}"
         )  # fmt: skip
         self._evidence.swapping.stop()
 
@@ -195,9 +206,6 @@ class AgentService:
         if self._spec is None:  # a later one is the same world in a new incarnation
             low, high = np.asarray(spec.action_low, np.float32), np.asarray(spec.action_high, np.float32)
             self._policy = UniformPolicy(low, high)
-            adoption = Adoption(spec, self._ledger)
-            if self._last_published is not None:
-                adoption.offer(self._last_published, self._clock.now_ns())
-            self._adoption = adoption
+            self._adoption = Adoption(spec, self._ledger)
         self._freshness = Freshness(spec.tick_ns)
         self._spec = spec

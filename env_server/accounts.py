@@ -73,8 +73,7 @@ class Accounts:
 
     def miss(self, cause: MissCause) -> None:
         """Enter a missed deadline. Only now, with its cause, so that the causes always add up."""
-        self._ledger.count("missed")
-        self._ledger.count(f"missed.{cause}")
+        self._ledger.count_together("missed", f"missed.{cause}")
 
     def close(self, pacer: Pacer) -> None:
         """Enter the deadlines that were lost after the last executed tick."""

@@ -29,7 +29,10 @@ LEAD_NS = 100_000_000  # from announcing T0 to T0, so that the spec is with ever
 PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for
 PEERS_POLL_S = 0.05
 REMEMBERED_TICKS = 64  # sending times kept, so that a late answer's latency is known too
-ACTIONS_KEPT = 64  # between two deadlines there is one, unless this process was stalled
+ACTIONS_KEPT = (
+    64  # between two deadlines there are two, with the rehearsal's, unless this process was stalled
+)
+LONGEST_REST_S = 0.1  # how long the books wait for the answer, and a stop for the books
 LAST_ANSWER_S = 0.1  # how long the end waits for the answer that tells why the last deadline was missed
 
 
@@ -119,7 +122,7 @@ class EnvService:
         if stop.is_set():
             return
         self.announce()
-        rest_s = self._tick_ns / 2e9
+        rest_s = min(self._tick_ns / 2e9, LONGEST_REST_S)
         for tick in self.pacer.ticks(stop):
             entry = self.act(tick)
             # The agent has the core until its answer is there; the books can wait.

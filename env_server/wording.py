@@ -47,11 +47,8 @@ def word_spec(
 
 
 def word_step(stamp: Stamp, tick: Tick, turn: Turn, latency: Latency, position: Position) -> Step:
-    """The report of one executed tick, without a miss's cause; `latency` is told only when the answer came
-    in time.
-    """
-    if turn.verdict != "answer":
-        latency = Latency()
+    """The report of one executed tick, without a miss's cause; `latency` is that of the newest answer."""
+    in_time, late = (latency, Latency()) if turn.verdict == "answer" else (Latency(), latency)
     decision = turn.decision
     return Step(
         env=stamp.env,
@@ -76,8 +73,10 @@ def word_step(stamp: Stamp, tick: Tick, turn: Turn, latency: Latency, position: 
         fallback="" if decision is None else decision.fallback,
         cause="",
         skipped=tick.skipped,
-        loop_ns=latency.loop_ns,
-        reaction_ns=latency.reaction_ns,
+        loop_ns=in_time.loop_ns,
+        reaction_ns=in_time.reaction_ns,
+        late_loop_ns=late.loop_ns,
+        late_reaction_ns=late.reaction_ns,
         drift=turn.drift,
         position=position.astype("<f8").tobytes(),
     )

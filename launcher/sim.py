@@ -78,6 +78,7 @@ class Simulation:
         for tick in self.env.pacer.ticks(stop):
             self.agent.poll_policies()
             self.env.step(tick)  # the agent answers within it
+            self.agent.check()
             flushed = self.env.journal.flush_due(self._clock.now_ns())
             self.learner.catch_up()  # every tick: publications are due between flushes too
             if flushed:

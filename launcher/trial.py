@@ -39,8 +39,8 @@ class Series:
         for step in steps:
             self.tick.append(step.tick)
             self.pacing_ns.append(step.woke_ns - step.due_ns)
-            self.loop_ns.append(step.loop_ns)
-            self.reaction_ns.append(step.reaction_ns)
+            self.loop_ns.append(max(step.loop_ns, step.late_loop_ns))
+            self.reaction_ns.append(max(step.reaction_ns, step.late_reaction_ns))
             self.missed.append(step.missed)
 
 

@@ -1,7 +1,7 @@
 """Where received bytes wait for a service: what both buses' readers are made of.
 
 A bus only puts bytes and their arrival time here, on whatever thread it receives on. Decoding happens
-on the reader's own thread, so a slow or bad message costs the transport nothing.
+on the reader's own thread, so a slow or bad message costs the transport nothing; but for an `Attendant`.
 """
 
 from __future__ import annotations

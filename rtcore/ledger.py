@@ -55,6 +55,11 @@ class Ledger:
         with self._lock:
             self._counters[name] += n
 
+    def count_together(self, *names: str) -> None:
+        """Add one to each: no snapshot has only some of it."""
+        with self._lock:
+            self._counters.update(names)
+
     def set_counter(self, name: str, value: int) -> None:
         """Take over a count that is kept elsewhere, such as the bus's; it must not fall either."""
         with self._lock:

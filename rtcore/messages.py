@@ -92,6 +92,8 @@ class Step(Message, frozen=True, kw_only=True):
     drift: float  # the true value; for the recorder and regret, never read by agent or learner
     position: bytes  # float64 simulator qpos (or position), for drawing
     rehearsal: bool = False  # sent once more to keep the act path warm: on the real-time path only
+    late_loop_ns: Index = -1  # of the newest answer heard at this tick that came too late; -1: there was none
+    late_reaction_ns: Index = -1
 
 
 class StepBatch(Message, frozen=True, kw_only=True):

@@ -167,7 +167,7 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
 def background(loop: Callable[[Stop], None], *, name: str, ends: Stop) -> Iterator[None]:
     """Run `loop(stop)` on a thread for as long as the block runs, then stop and join it.
 
-    The thread has ordinary scheduling, whatever the process has: it must not delay a tick. If it fails,
+    The thread comes after those that act (`realtime.step_back`): it must not delay a tick. If it fails,
     it sets `ends`, the process's own stop, and the block's end raises what it failed with: a process
     never goes on without one of its threads.
     """

@@ -1,7 +1,7 @@
 """The bus between processes, over Zenoh.
 
 Callbacks run on Zenoh's receiving threads, which carry all topics of a link: they stamp, keep the bytes
-and return.
+and return. The one exception is `attend`, for an answer that cannot wait.
 """
 
 from __future__ import annotations

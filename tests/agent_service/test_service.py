@@ -226,10 +226,11 @@ def test_a_restarted_environment_is_answered_once_it_declares_itself(rig: Rig) -
 def test_beside_no_learner_the_last_published_policy_acts() -> None:
     rig = Rig(MemoryHub(), last_published=policy(9, mean_bias=0.5))
     rig.specs.put(SPEC)
-    answer = rig.answer(step(0))
+    assert rig.answer(step(0)) is not None  # the environment is known now, and the policy can be checked
+    answer = rig.answer(step(1))
     assert answer is not None and answer.policy_version == 9
     rig.policies.put(policy(9, mean_bias=0.5))  # a learner comes, with the same one
     rig.policies.put(policy(10))
-    answer = rig.answer(step(1))
+    answer = rig.answer(step(2))
     assert answer is not None and answer.policy_version == 10
     assert rig.ledger.counter("policies.repeated") == 1
