@@ -26,7 +26,7 @@ def test_the_clocks_may_be_those_of_two_hosts() -> None:
 
 
 def test_what_was_the_shortest_way_is_forgotten() -> None:
-    """Clocks that drift apart by 900 ppm make every way longer: 4.5 ticks in 5000, and none of them is old."""
+    """Clocks that drift apart by 900 ppm make every way longer: 4.5 ticks in 5000; none of them is old."""
     freshness = Freshness(MS)
     assert not any(freshness.is_old(k * MS, k * MS + k * 900) for k in range(5 * MEMORY))
 
