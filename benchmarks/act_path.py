@@ -24,7 +24,7 @@ import tyro
 from benchmarks.harness import ACTING, background_child, child_result, run_system, world, write_result
 from benchmarks.outcome import Outcome, Quantile, cell, median, ratios, turns
 from benchmarks.peers import TRANSPORTS
-from launcher.echo_links import Transport as EchoTransport
+from launcher.echo.links import Transport as EchoTransport
 from rtcore.realtime import Rt
 
 ECHOES: tuple[str, ...] = get_args(EchoTransport)

@@ -14,14 +14,14 @@ import tyro
 
 from benchmarks.harness import LATE_SHARE
 from benchmarks.outcome import Outcome
-from launcher.echo import EchoResult, measure_echo
-from launcher.echo_links import Transport
+from launcher.echo.links import Transport
+from launcher.echo.measure import EchoResult, measure_echo
 from rtcore.realtime import Rt
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """As `launcher.echo.measure_echo` takes them."""
+    """As `launcher.echo.measure.measure_echo` takes them."""
 
     transport: Transport = "zenoh"
     hz: float = 500.0

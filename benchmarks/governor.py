@@ -24,8 +24,8 @@ import tyro
 
 from benchmarks.machine import facts
 from launcher import presets
-from launcher.trial import Load, Trial, trial_config
-from launcher.trial_run import run_trial
+from launcher.latency.trial import Load, Trial, trial_config
+from launcher.latency.trial_run import run_trial
 
 Setting = Literal["off", "on", "no load"]
 SETTINGS: tuple[Setting, ...] = ("off", "on", "no load")

@@ -48,8 +48,16 @@ COMMANDS = (
     Command("hold", "launcher.control:hold", "hold the policy of a running system"),
     Command("resume", "launcher.control:resume", "go on with the schedule after a hold"),
     Command("stop", "launcher.control:stop", "end a running system in order"),
-    Command("latency", "launcher.latency:latency", "the real-time test of this machine, beside a bare echo"),
-    Command("doctor", "launcher.doctor:doctor", "what this machine lacks for real time, and how to grant it"),
+    Command(
+        "latency",
+        "launcher.latency.command:latency",
+        "the real-time test of this machine, beside a bare echo",
+    ),
+    Command(
+        "doctor",
+        "launcher.doctor.command:doctor",
+        "what this machine lacks for real time, and how to grant it",
+    ),
     Command("report", "launcher.report:report", "a run's report again"),
     Command("view", "launcher.view:view", "open a run's recording in Rerun"),
 )

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from launcher.doctor import stolen
-from launcher.doctor_facts import (
+from launcher.doctor.command import stolen
+from launcher.doctor.facts import (
     Facts,
     Probed,
     bounding_set,
@@ -20,8 +20,8 @@ from launcher.doctor_facts import (
     has_bf16,
     preemption,
 )
-from launcher.doctor_findings import CONTAINER, HAND_DOWN, Finding, findings, verdict
-from launcher.echo import EchoResult
+from launcher.doctor.findings import CONTAINER, HAND_DOWN, Finding, findings, verdict
+from launcher.echo.measure import EchoResult
 from rtcore.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, FIFO, GRANTS, MEMORY, PINNING, SLACK, Privileges
 from tests.launcher.commands import command_line, tenuto
 from tests.launcher.test_latency import ECHO

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from launcher.echo import EchoError, EchoResult, measure_echo
-from launcher.echo_pair import ACTION_BYTES, STEP_BYTES, TICK_BYTES, Client, answer
+from launcher.echo.measure import EchoError, EchoResult, measure_echo
+from launcher.echo.pair import ACTION_BYTES, STEP_BYTES, TICK_BYTES, Client, answer
 from rtcore.clock import VirtualClock
 from rtcore.config import ConfigError
 from rtcore.pacer import Tick

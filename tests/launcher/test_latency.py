@@ -16,16 +16,16 @@ import pytest
 from rich.console import Console
 
 from launcher import presets
-from launcher.echo import EchoResult
-from launcher.hold_rate import Counted
-from launcher.latency import LatencyOptions, judged, parse_rates, plan
-from launcher.latency_picture import draw, envelope, survival
-from launcher.latency_results import Cell, Results, as_json
-from launcher.latency_table import cell_table, overview, remarks
+from launcher.echo.measure import EchoResult
+from launcher.latency.command import LatencyOptions, judged, parse_rates, plan
+from launcher.latency.hold_rate import Counted
+from launcher.latency.picture import draw, envelope, survival
+from launcher.latency.results import Cell, Results, as_json
+from launcher.latency.table import cell_table, overview, remarks
+from launcher.latency.trial import Series, Trial, trial_config
 from launcher.machine import processor
 from launcher.quantiles import quantiles_us
 from launcher.stealing import steal_s
-from launcher.trial import Series, Trial, trial_config
 from rtcore.config import ConfigError
 from tests.launcher.commands import command_line, tenuto
 from tests.rtcore.steps import make_step

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from launcher.hold_rate import (
+from launcher.latency.hold_rate import (
     Counted,
     Search,
     lower_bound,

@@ -19,16 +19,16 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from launcher import presets
 from launcher.cli import DONE, CommandError
 from launcher.drawing import clock
-from launcher.echo import EchoError, EchoResult, measure_echo
-from launcher.echo_links import Transport
-from launcher.hold_rate import LADDER_HZ, LIMIT, Counted, Search, search, statement
-from launcher.latency_results import SETTLED_S, Cell, Results, as_json
-from launcher.latency_table import ECHOES, LOADS, cell_table, overview, remarks
+from launcher.echo.links import Transport
+from launcher.echo.measure import EchoError, EchoResult, measure_echo
+from launcher.latency.hold_rate import LADDER_HZ, LIMIT, Counted, Search, search, statement
+from launcher.latency.results import SETTLED_S, Cell, Results, as_json
+from launcher.latency.table import ECHOES, LOADS, cell_table, overview, remarks
+from launcher.latency.trial import Load, Trial, trial_config
+from launcher.latency.trial_run import TrialError, run_trial
 from launcher.machine import machine
 from launcher.parsing import parse
 from launcher.run import RUNS
-from launcher.trial import Load, Trial, trial_config
-from launcher.trial_run import TrialError, run_trial
 from rtcore.config import ConfigError, RunConfig
 from rtcore.realtime import Rt
 from rtcore.run_dir import default_run_path, write_atomic
@@ -226,7 +226,7 @@ def _finish(results: Results, out: Path, console: Console) -> None:
     write_atomic(out / "latency.json", (json.dumps(as_json(results), indent=2) + "\n").encode())
     console.print(f"\nresults  {out / 'latency.json'}", highlight=False, soft_wrap=True)
     if results.cells:
-        from launcher.latency_picture import draw  # a second, and memory, that no measurement should see
+        from launcher.latency.picture import draw  # a second, and memory, that no measurement should see
 
         draw(results, out / "latency.png")
         console.print(f"picture  {out / 'latency.png'}", highlight=False, soft_wrap=True)

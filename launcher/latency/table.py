@@ -9,10 +9,10 @@ from rich.text import Text
 
 from launcher import drawing
 from launcher.drawing import ACCENT, LABEL
-from launcher.echo_links import Transport
-from launcher.latency_results import SETTLED_S, Cell
+from launcher.echo.links import Transport
+from launcher.latency.results import SETTLED_S, Cell
+from launcher.latency.trial import Load
 from launcher.quantiles import SHARES, Quantiles
-from launcher.trial import Load
 
 LOADS: dict[Load, str] = {"learner": "learner saturating", "none": "no load"}
 ECHOES: dict[Transport, str] = {"zenoh": "bare Zenoh echo", "unix": "bare unix socket"}

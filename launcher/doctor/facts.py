@@ -171,7 +171,7 @@ def probe() -> bytes:
 
 def _probe() -> Probed:
     done = subprocess.run(
-        [sys.executable, "-m", "launcher.doctor_facts"],
+        [sys.executable, "-m", "launcher.doctor.facts"],
         capture_output=True,
         timeout=PROBE_LIMIT_S,
         check=True,

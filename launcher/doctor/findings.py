@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from launcher.doctor_facts import Facts
+from launcher.doctor.facts import Facts
 from rtcore.realtime import (
     CAP_IPC_LOCK,
     CAP_SYS_NICE,

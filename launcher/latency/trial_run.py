@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from launcher.latency.trial import Load, Series, Trial
 from launcher.stealing import StealMeter
-from launcher.trial import Load, Series, Trial
 from rtcore import channels
 from rtcore.config import RunConfig
 from rtcore.config_io import dump_toml

@@ -1,4 +1,4 @@
-"""`python -m launcher.echo_pair client|server|load DIR`: the processes behind `launcher.echo`.
+"""`python -m launcher.echo.pair client|server|load DIR`: the processes behind `launcher.echo.measure`.
 
 The pair has the places of env server and agent, and nothing of either: no environment, no policy, no bus.
 The third one stands in for a learner that takes all that it is given.
@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from launcher.echo_links import LINKS, Send, Transport
+from launcher.echo.links import LINKS, Send, Transport
 from launcher.stealing import StealMeter
 from rtcore import channels, realtime
 from rtcore.clock import Clock

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from launcher.echo import EchoResult
-from launcher.echo_links import Transport
-from launcher.hold_rate import Search, statement
+from launcher.echo.links import Transport
+from launcher.echo.measure import EchoResult
+from launcher.latency.hold_rate import Search, statement
+from launcher.latency.trial import Load, Quantity, Trial
 from launcher.quantiles import SHARES, Quantiles
-from launcher.trial import Load, Quantity, Trial
 
 SCHEMA = 1
 SETTLED_S = 1.0  # the first second has the page faults, the cold caches and the first connections

@@ -16,11 +16,11 @@ from rich.text import Text
 
 from launcher import drawing
 from launcher.cli import DONE, FAILED, CommandError
-from launcher.doctor_facts import gather
-from launcher.doctor_findings import Finding, State, findings, verdict
+from launcher.doctor.facts import gather
+from launcher.doctor.findings import Finding, State, findings, verdict
 from launcher.drawing import ACCENT, LABEL
-from launcher.echo import EchoError, EchoResult, measure_echo
-from launcher.latency_results import SETTLED_S
+from launcher.echo.measure import EchoError, EchoResult, measure_echo
+from launcher.latency.results import SETTLED_S
 from launcher.machine import machine
 from launcher.parsing import parse
 from launcher.run import RUNS

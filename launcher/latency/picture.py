@@ -21,11 +21,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from launcher.echo_links import Transport
-from launcher.latency_results import Cell, Results
-from launcher.latency_table import ECHOES, LOADS
+from launcher.echo.links import Transport
+from launcher.latency.results import Cell, Results
+from launcher.latency.table import ECHOES, LOADS
+from launcher.latency.trial import Load, Trial
 from launcher.quantiles import Nanoseconds
-from launcher.trial import Load, Trial
 
 # Okabe and Ito's colours: told apart with any kind of colour vision, and in grey by the line's style.
 LOOP, MISS, GREY = "#0072B2", "#D55E00", "#555555"

@@ -20,8 +20,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from launcher.echo_links import LINKS, Transport
-from launcher.echo_pair import HELLO_LIMIT_S, Order, Outcome
+from launcher.echo.links import LINKS, Transport
+from launcher.echo.pair import HELLO_LIMIT_S, Order, Outcome
 from launcher.quantiles import Nanoseconds, Quantiles, quantiles_us
 from rtcore.config import ConfigError
 from rtcore.realtime import Rt
@@ -135,7 +135,7 @@ def _process(part: str, directory: Path) -> Iterator[subprocess.Popen[bytes]]:
     threads = ["env", "OPENBLAS_NUM_THREADS=1"] if part == "load" else []  # as the learner: one of them
     with (directory / f"{part}.out").open("wb") as output:
         process = subprocess.Popen(
-            [*threads, sys.executable, "-m", "launcher.echo_pair", part, str(directory)],
+            [*threads, sys.executable, "-m", "launcher.echo.pair", part, str(directory)],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

@@ -1,0 +1,1 @@
+"""`tenuto doctor`: what this machine lacks for real time."""

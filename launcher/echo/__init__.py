@@ -1,0 +1,1 @@
+"""A bare pacer-and-echo pair: what the machine does without Tenuto."""

@@ -1,0 +1,1 @@
+"""`tenuto latency`: the real-time test of this machine."""
