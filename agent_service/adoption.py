@@ -12,6 +12,7 @@ import numpy as np
 from agent_service.inference import Array, TanhGaussianPolicy
 from rtcore.ledger import Ledger
 from rtcore.messages import Policy, Spec
+from rtcore.spaces import Spaces
 from rtcore.weights import WeightsError, verify
 
 
@@ -58,7 +59,7 @@ class Adoption:
     def _prepare(self, policy: Policy) -> TanhGaussianPolicy:
         if policy.version < self._newest_version:
             raise WeightsError(f"version {self._newest_version} was there before")
-        arrays = verify(policy, self._spec.observation_dim, self._spec.action_dim)
+        arrays = verify(policy, Spaces.of(self._spec))
         ready = TanhGaussianPolicy(policy.version, policy.architecture, arrays, self._low, self._high)
         ready.warm_up()
         return ready

@@ -21,8 +21,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from env_server.world import Vector, World
-from env_server.worlds import make_world
+from env_server.worlds.registry import make_world
+from env_server.worlds.world import Vector, World
 from rtcore.config import RunConfig
 from rtcore.run_dir import RunDir
 

@@ -23,7 +23,7 @@ import tyro
 
 from benchmarks.baselines import baseline, still
 from benchmarks.intervals import check_seeds, half_interval
-from env_server.worlds import resolve
+from env_server.worlds.registry import resolve
 from experiments.presets import halfcheetah
 from launcher.sim import simulate
 from rtcore.config import RunConfig, ScheduleConfig

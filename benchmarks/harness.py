@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.machine import facts
 from benchmarks.outcome import Outcome, share_above
-from env_server.worlds import resolve
+from env_server.worlds.registry import resolve
 from launcher import presets
 from launcher.stealing import StealMeter
 from launcher.summary import Summary, add_up, discrepancies, summarise
@@ -168,7 +168,7 @@ def placement(log: Path) -> str:
 
 def random_policy(config: RunConfig, hidden: Sequence[int]) -> Policy:
     """A policy for the world of `config` that nobody has trained; the same for the same sizes."""
-    from env_server.worlds import make_world
+    from env_server.worlds.registry import make_world
 
     with contextlib.closing(make_world(config.env, 0)) as made:
         observation_dim = made.observation_dim + config.env.observe_actions * made.action_dim

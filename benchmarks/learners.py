@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from learner.fsac import Fsac
-from learner.gradients import propose
+from learner.deep.fsac import Fsac
+from learner.deep.gradients import propose
+from learner.deep.sac import Sac
 from learner.replay import Replay
-from learner.sac import Sac
 from rtcore.config import ForecastConfig, LearnerConfig
 from rtcore.windows import Window
 

@@ -34,11 +34,11 @@ from benchmarks.learners import (
     value_flops,
 )
 from learner.arithmetic import product_type
-from learner.gradients import Mlp, Pass, Proposal, policy_loss_to_heads, propose
+from learner.deep.gradients import Mlp, Pass, Proposal, policy_loss_to_heads, propose
+from learner.deep.networks import Adam, FlatParameters, make_networks
+from learner.deep.tensors import BatchTensors
 from learner.memory import keep_freed_memory
-from learner.networks import Adam, FlatParameters, make_networks
 from learner.replay import Replay, make_batch
-from learner.tensors import BatchTensors
 from rtcore.config import LearnerConfig, Precision
 
 ALPHA = 0.2

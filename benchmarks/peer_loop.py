@@ -33,6 +33,7 @@ from rtcore.lifecycle import Stop, die_with_parent, stop_on_signals
 from rtcore.messages import Action, Step
 from rtcore.monotonic import MonotonicClock
 from rtcore.pacer import Pacer, Tick
+from rtcore.spaces import Spaces
 from rtcore.weights import verify
 
 OBSERVATION_DIM, ACTION_DIM, POSITION_DIM = 17, 6, 9  # HalfCheetah
@@ -60,7 +61,7 @@ class Actor:
     def __init__(self, clock: Clock) -> None:
         made = policy(OBSERVATION_DIM, ACTION_DIM, HIDDEN)
         bound = np.ones(ACTION_DIM, np.float32)
-        weights = verify(made, OBSERVATION_DIM, ACTION_DIM)
+        weights = verify(made, Spaces(OBSERVATION_DIM, ACTION_DIM))
         self._policy = TanhGaussianPolicy(1, made.architecture, weights, -bound, bound)
         self._rng = np.random.default_rng(0)
         self._clock = clock

@@ -89,7 +89,7 @@ def latencies(arguments: Arguments) -> list[dict[str, Any]]:
 
 def dimensions(name: str) -> tuple[int, int]:
     """Of a preset's observation and action."""
-    from env_server.worlds import make_world
+    from env_server.worlds.registry import make_world
 
     config = world(name, hz=100.0, seconds=1.0, rt="off")
     made = make_world(config.env, 0)

@@ -33,6 +33,7 @@ from launcher.quantiles import quantiles_us
 from launcher.stealing import StealMeter
 from rtcore import channels, realtime
 from rtcore.monotonic import MonotonicClock
+from rtcore.spaces import Spaces
 from rtcore.weights import verify
 
 Variant = Literal["v1", "ts-v1"]  # a thread per step, or one thread for all
@@ -125,7 +126,7 @@ def make_actor() -> Callable[[Any], NDArray[np.float32]]:
     """Our inference."""
     made = policy(OBSERVATION_DIM, ACTION_DIM, HIDDEN)
     bound = np.ones(ACTION_DIM, np.float32)
-    weights = verify(made, OBSERVATION_DIM, ACTION_DIM)
+    weights = verify(made, Spaces(OBSERVATION_DIM, ACTION_DIM))
     actor = TanhGaussianPolicy(1, made.architecture, weights, -bound, bound)
     rng = np.random.default_rng(0)
     actor.act(np.zeros(OBSERVATION_DIM, np.float32), rng)  # the first one is slow

@@ -46,10 +46,10 @@ from benchmarks.learners import (
     value_flops,
 )
 from learner.arithmetic import product_type
-from learner.distil import FIRST_FITS, FIT_EVERY
+from learner.deep.distil import FIRST_FITS, FIT_EVERY
+from learner.deep.sac import Sac
 from learner.memory import keep_freed_memory
 from learner.replay import Replay
-from learner.sac import Sac
 from rtcore.config import LearnerConfig, Precision
 
 WARM_UP = 20

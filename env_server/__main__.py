@@ -6,7 +6,7 @@ import sys
 from contextlib import closing
 
 from env_server.service import EnvService
-from env_server.worlds import make_world
+from env_server.worlds.registry import make_world
 from rtcore import channels
 from rtcore.process import Process, background, run_process
 

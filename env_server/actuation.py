@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from env_server.world import Vector, World
+from env_server.worlds.world import Vector, World
 from rtcore.config import EnvConfig, MissPolicy
 from rtcore.messages import Action, Fallback
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from env_server.actuation import Actuation, Decision, Verdict
-from env_server.world import Outcome, Vector, World
+from env_server.worlds.world import Outcome, Vector, World
 from rtcore.messages import Action
 
 WORLD_STREAM = 0  # keeps the world's random numbers apart from the agent's and the learner's

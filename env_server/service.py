@@ -11,11 +11,11 @@ from env_server.accounts import Accounts, Latency
 from env_server.actuation import Actuation, Rules
 from env_server.blame import Blame, Miss
 from env_server.journal import Journal
-from env_server.period import tick_ns
 from env_server.rehearsal import Rehearsal
 from env_server.rollout import Rollout, Turn
 from env_server.wording import Stamp, unit_ns, word_spec, word_step
-from env_server.world import World
+from env_server.worlds.period import tick_ns
+from env_server.worlds.world import World
 from rtcore import channels
 from rtcore.bus import Bus, Received
 from rtcore.clock import Clock

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from env_server.accounts import Latency
 from env_server.rollout import Turn
-from env_server.world import Position, World
+from env_server.worlds.world import Position, World
 from rtcore.config import EnvConfig
 from rtcore.messages import Spec, Step
 from rtcore.pacer import Tick
@@ -43,6 +43,8 @@ def word_spec(
         action_delay_ticks=env.action_delay_ticks,
         native_period_ns=round(simulated_s * 1e9),
         scene=world.scene,
+        states=world.states,
+        actions=world.actions,
     )
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction
 
-from env_server import worlds
+from env_server.worlds import registry as worlds
 from launcher import presets
 from launcher.parsing import HELP_FLAGS, given, parse
 from rtcore.config import (

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 
 from agent_service.service import AgentService
 from env_server.service import EnvService
-from env_server.worlds import make_world
+from env_server.worlds.registry import make_world
 from launcher.summary import StatsByProcess
 from learner.arithmetic import prepare
 from learner.service import LearnerService

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learner.checkpoint import State
-from learner.fsac import Fsac
+from learner.deep.fsac import Fsac
+from learner.deep.sac import Sac
 from learner.replay import Replay
-from learner.sac import Sac
-from rtcore.config import LearnerConfig
+from rtcore.config import RunConfig
 from rtcore.messages import Architecture
+from rtcore.spaces import Spaces
 from rtcore.windows import Window
 
 
@@ -38,6 +39,14 @@ class Algorithm(Protocol):
             ValueError: the replay holds no transition.
         """
 
+    def iterate(self, g: int) -> bool:
+        """Iterate g of the window is about to be published, or its time is over: bring the policy there,
+        if it is improved unit by unit and not by `update`. Asked again, it does nothing.
+
+        Returns:
+            Whether the policy changed.
+        """
+
     def begin_window(self, window: Window, unit: int) -> None:
         """Window m was entered in `unit`, which is t_m unless the learner came late."""
 
@@ -61,10 +70,13 @@ class Algorithm(Protocol):
         """
 
 
-def make_algorithm(
-    config: LearnerConfig, observation_dim: int, action_dim: int, seed: int, replay: Replay
-) -> Algorithm:
-    """The algorithm that `config.algo` names, with fresh networks."""
+def make_algorithm(run: RunConfig, spaces: Spaces, seed: int, replay: Replay) -> Algorithm:
+    """The algorithm that `run.learner.algo` names, with fresh networks or tables.
+
+    Raises:
+        ConfigError: it does not fit the world's spaces.
+    """
+    config = run.learner
     if config.algo == "fsac":
-        return Fsac(config, observation_dim, action_dim, seed, replay)
-    return Sac(config, observation_dim, action_dim, seed, replay)
+        return Fsac(config, spaces.observation_dim, spaces.action_dim, seed, replay)
+    return Sac(config, spaces.observation_dim, spaces.action_dim, seed, replay)

@@ -35,6 +35,7 @@ from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.messages import Command, CommandReply, Phase, Spec, WindowNotice
 from rtcore.run_dir import RunDir
+from rtcore.spaces import Spaces
 from rtcore.windows import WindowClock, make_schedule
 
 IDLE_WAIT_S = 0.02  # nothing to learn from: wait so long for the next batch (they come every 50 ms)
@@ -151,12 +152,12 @@ class LearnerService:
         """One gradient step."""
         begin_ns = self._clock.now_ns()
         improve = self._phase == "update"
+        steps, policy_steps = algorithm.gradient_steps, algorithm.policy_steps
         algorithm.update(improve_policy=improve)
         self._budget.spend()
         self._publication.improved |= improve
-        self._ledger.count("gradient_steps")
-        if improve:
-            self._ledger.count("policy_steps")
+        self._ledger.count("gradient_steps", algorithm.gradient_steps - steps)
+        self._ledger.count("policy_steps", algorithm.policy_steps - policy_steps)
         self._note_duration(self._clock.now_ns() - begin_ns)
 
     def _meet(self, spec: Spec) -> None:
@@ -172,7 +173,7 @@ class LearnerService:
         replay = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
         self._intake.meet(spec, replay)
         seed = self._config.seed * 10 + LEARNER_STREAM
-        self._algorithm = make_algorithm(learner, spec.observation_dim, spec.action_dim, seed, replay)
+        self._algorithm = make_algorithm(self._config, Spaces.of(spec), seed, replay)
         version = resume.last_published(self._run_dir)
         self._publication.go_on_from(version)
         if resume.restore(self._run_dir, self._algorithm, self._intake):
@@ -217,12 +218,19 @@ class LearnerService:
                 self._announce(happening, spec)
             case PublishDue(window, iterate) if not self._conductor.improving:  # held in the same turn
                 self._publication.withhold(window.m, iterate, self._clock.now_ns())
-            case PublishDue():
+            case PublishDue(_, iterate):
+                self._iterate(self._algorithm, iterate)
                 self._publication.publish(self._algorithm, happening, spec, self._clock, self._windows)
             case PublishMissed(window, iterate):
+                self._iterate(self._algorithm, iterate)
                 self._publication.withhold(window.m, iterate, self._clock.now_ns())
             case _:
                 assert_never(happening)
+
+    def _iterate(self, algorithm: Algorithm, g: int) -> None:
+        before = algorithm.policy_steps
+        self._publication.improved |= algorithm.iterate(g)
+        self._ledger.count("policy_steps", algorithm.policy_steps - before)
 
     def _announce(self, entered: PhaseEntered, spec: Spec) -> None:
         window = entered.window

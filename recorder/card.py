@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 
 from rtcore.config import DriftConfig, LearnerConfig, RunConfig, ScheduleConfig
 from rtcore.messages import Spec
@@ -55,6 +56,11 @@ def _drift(drift: DriftConfig) -> str:
         case "sine":
             phase = f" + {drift.phase:g}" if drift.phase else ""
             return f"{drift.offset:g} + {drift.amplitude:g} sin({drift.omega:g} t{phase})"
+        case _:
+            plain, given = asdict(DriftConfig(kind=drift.kind)), asdict(drift)
+            return ", ".join(
+                [drift.kind, *(f"{name} {value}" for name, value in given.items() if value != plain[name])]
+            )
 
 
 def _schedule(schedule: ScheduleConfig) -> str:
@@ -70,7 +76,8 @@ def _forecast(learner: LearnerConfig) -> str:
     forecast = learner.forecast
     if learner.algo == "sac" or forecast.kind == "none":
         return "none"
-    horizon = "the window" if forecast.horizon is None else f"{forecast.horizon:g} units"
+    words = {"window": "the window", "replay": "the window and the replay's age"}
+    horizon = words.get(str(forecast.horizon)) or f"{forecast.horizon} units"
     return f"{forecast.kind}, {forecast.l_p} past critics, basis {forecast.basis}, horizon {horizon}"
 
 

@@ -9,7 +9,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-DriftKind = Literal["none", "constant", "sine"]
+DriftKind = Literal[
+    "none",
+    "constant",
+    "sine",
+    "ramp",
+    "square",
+    "switch",
+    "random_walk",
+    "ou",
+    "noise",
+    "burst",
+    "recorded",
+]
+Notify = Literal["none", "changed", "value"]
+Algo = Literal["sac", "fsac", "rsac", "q", "fq", "npg", "tempo"]
+Basis = Literal["constant", "identity", "polynomial", "fourier"]
 MissPolicy = Literal["hold", "neutral", "hold_then_neutral"]
 ScheduleKind = Literal["fixed", "explicit"]
 Rounding = Literal["floor", "ceil", "paper_le"]
@@ -18,13 +33,35 @@ Precision = Literal["float32", "bfloat16", "auto"]
 
 @dataclass(frozen=True, kw_only=True)
 class DriftConfig:
-    """How the target moves with the unit t: offset, or offset + amplitude * sin(omega * t + phase)."""
+    """How a quantity moves with the unit t (`env_server.worlds.drift` has each kind's formula)."""
 
     kind: DriftKind = "sine"
-    offset: float = 0.0
-    amplitude: float = 0.0
-    omega: float = 0.0  # radians per unit
-    phase: float = 0.0  # radians
+    offset: float = 0.0  # where it moves around, or starts from
+    amplitude: float = 0.0  # how far it moves: sine, square, ramp, switch, burst
+    omega: float = 0.0  # sine, square: radians per unit
+    phase: float = 0.0  # sine, square: radians
+    at: float | Literal["random"] = 0.0  # ramp, switch, burst: the unit it begins in; or drawn from [0, span)
+    span: float = 1.0  # ramp, burst: how many units it takes; switch: see `at`
+    every: float = 0.0  # switch, burst: again after so many units; 0: once
+    rate: float = 0.1  # ou: pull towards the offset, per unit
+    sd: float = 0.0  # random_walk, ou, noise: standard deviation of a unit's step
+    low: float | None = None  # bounds of the value, of any kind
+    high: float | None = None
+    seed: int | None = None  # of what is random; None: the run's seed
+    path: str = ""  # recorded: a CSV file with the columns "unit" and "value"
+
+
+def _still() -> DriftConfig:
+    return DriftConfig(kind="none")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsConfig:
+    """Drift of the dynamics: each a factor on what the world was built with; kind "none" leaves it alone."""
+
+    mass: DriftConfig = field(default_factory=_still)
+    friction: DriftConfig = field(default_factory=_still)
+    gravity: DriftConfig = field(default_factory=_still)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,10 +74,32 @@ class RewardConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CliffConfig:
+    """What the paper leaves open about its cliffworld (section 7.1, appendix). Defaults: docs/paper.md."""
+
+    pays: Literal["arrive", "leave"] = "leave"  # the reward of a cell comes on entering or on leaving it
+    inactive_goal: Literal["ordinary", "terminal"] = "terminal"
+    step_reward: float = -1.0  # the paper prints -100, what falling costs
+    goal_reward: float = 100.0
+    restart_reward: float = -100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class MdpConfig:
+    """A random finite MDP between two ends, A and B; the drift w in [0, 1] says how far it is from A to B."""
+
+    states: int = 6
+    actions: int = 3
+    concentration: float = 0.3  # of the Dirichlet rows of P: small is nearly deterministic
+    drifting: Literal["reward", "dynamics", "both"] = "reward"
+    slip: float = 0.0  # chain: probability of a step the other way
+
+
+@dataclass(frozen=True, kw_only=True)
 class EnvConfig:
     """The world and its clock."""
 
-    id: str = "HalfCheetah-v5"  # "pointmass" or any Gymnasium id
+    id: str = "HalfCheetah-v5"  # a world of ours or any Gymnasium id
     name: str = "env0"  # in the keys and in every step
     hz: float | None = None  # wall-clock control rate; derived from speed when not given
     speed: float | None = None  # times faster than native; derived from hz when not given
@@ -52,8 +111,12 @@ class EnvConfig:
     hold_ticks: int = 5  # for hold_then_neutral: held so many ticks, then neutral
     count: int = 1
     start_wait_s: float = 15.0  # T0 waits so long, at most, for an agent and a learner to be there
+    notify: Notify = "none"  # what the agent may know of the drift, appended to the observation
     drift: DriftConfig = field(default_factory=DriftConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
+    cliff: CliffConfig = field(default_factory=CliffConfig)
+    mdp: MdpConfig = field(default_factory=MdpConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,19 +143,53 @@ class ForecastConfig:
     """ForQ: the Q function of the next window from past critics (paper, section 6.1)."""
 
     kind: Literal["none", "forq"] = "forq"
-    l_p: int = 10  # past critics, one per unit
-    basis: Literal["constant", "identity"] = "identity"
-    horizon: float | None = None  # units ahead of t_m; None: the window's length
-    shrink: float = 0.0  # added to the slope's normal equation, in units^2; >= 0
-    trust: Literal["always", "never"] = "always"
+    l_p: int = 10  # past Q functions
+    every: int = 1  # units between them
+    basis: Basis = "identity"
+    degree: int = 2  # polynomial: its degree
+    period: float = 100.0  # fourier: of the slowest wave, in units
+    harmonics: int = 1  # fourier: waves of period / 1 .. period / harmonics
+    horizon: float | Literal["window", "replay"] = "window"  # units ahead of t_m; "window": its length, as in
+    # the paper; "replay": also the mean age of what the Q functions are learned from
+    shrink: float = 0.0  # added to the slopes' normal equations, in units^2; >= 0
+    trust: Literal["always", "judged", "never"] = "always"
+    parity: Literal["none", "authors"] = "none"  # "authors": the past critics are aliases of the live one
     distil: bool = False  # fit one network to the forecast at t_m, and improve the policy against that
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardModelConfig:
+    """rsac: what the drift of the reward is fitted with, and how it is forecast."""
+
+    model: Literal["declared", "learned"] = "declared"  # the family of `env.reward`, or a network
+    speed_entry: int = 0  # declared: which entry of the observation is the speed v
+    forecast: Literal["best", "persistence", "line", "level", "ar", "none"] = (
+        "best"  # none: relabelling alone
+    )
+    hidden: tuple[int, ...] = (32, 32)  # learned
+    lr: float = 3e-3  # learned: of the network
+    latent_lr: float = 2e-2  # learned: of the units' latents
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableConfig:
+    """q, fq, npg and tempo: what is kept in tables."""
+
+    step_size: float = 0.1  # alpha of Q-learning
+    epsilon: float = 0.1  # share of uniformly random actions
+    initial: float = 0.0  # of every Q
+    eta: float = 0.1  # npg: learning rate of the policy
+    entropy: float = 0.1  # npg: tau, the weight of the entropy
+    write_back: float = 0.0  # fq: share of the forecast that is written into Q at the start of a window
+    tempo_begin: int = 0  # tempo: the unit in which beta begins to rise from 0
+    tempo_span: int = 10  # tempo: units until it is 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerConfig:
     """The student."""
 
-    algo: Literal["sac", "fsac"] = "sac"
+    algo: Algo = "sac"
     utd: float = 1.0  # gradient steps per transition, at most
     hold_learning: Literal["full", "half", "off"] = "full"  # the critics' share of the hold phase
     learning_starts: int = 500  # transitions before the first gradient step
@@ -107,11 +204,15 @@ class LearnerConfig:
     target_entropy: float | None = None  # None: minus the action dimension
     replay_capacity: int = 1_000_000  # transitions
     replay_units: float | None = None  # sample only the newest units; None: all
+    replay_recency: float | None = None  # sample by age, exponential with this mean in units; None: uniform
+    value_network: bool = False  # critics learn towards a V network, as in Algorithm 2, not target critics
     threads: int = 1
     precision: Precision = "auto"  # of the networks' products, "auto": bfloat16 where the processor has it
     governor: Literal["on", "off"] = "on"  # give way to the agent before deadlines are missed
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     forecast: ForecastConfig = field(default_factory=ForecastConfig)
+    reward: RewardModelConfig = field(default_factory=RewardModelConfig)
+    table: TableConfig = field(default_factory=TableConfig)
 
 
 @dataclass(frozen=True, kw_only=True)

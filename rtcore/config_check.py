@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from rtcore.config import ConfigError, RunConfig
+from rtcore.config import ConfigError, ForecastConfig, LearnerConfig, RunConfig
 from rtcore.windows import make_schedule
 
 MOST = 10**9  # of anything counted; as seconds (31 years) its nanoseconds still fit a 64-bit message field
@@ -102,6 +102,26 @@ _ENDPOINT = _text(
 _POSITIVE = _number("(0, inf)")
 _FINITE = _number("(-inf, inf)")
 
+
+def _drift(prefix: str) -> dict[str, Rule]:
+    fields = {
+        "offset": _FINITE,
+        "amplitude": _FINITE,
+        "omega": _FINITE,
+        "phase": _FINITE,
+        "at": _or_word("random", _FINITE),
+        "span": _POSITIVE,
+        "every": _number("[0, inf)"),
+        "rate": _number("(0, 1]"),
+        "sd": _number("[0, inf)"),
+        "low": _optional(_FINITE),
+        "high": _optional(_FINITE),
+        "seed": _optional(_whole(0, 2**32 - 1)),
+        "path": _text(r".{0,4096}", "a file's path"),
+    }
+    return {f"{prefix}.{name}": rule for name, rule in fields.items()}
+
+
 RULES: dict[str, Rule] = {
     "preset": _NAME,
     "seed": _whole(0, 2**32 - 1),  # what NumPy and Gymnasium both take
@@ -117,10 +137,17 @@ RULES: dict[str, Rule] = {
     "env.hold_ticks": _whole(0),
     "env.count": _whole(1, 1),
     "env.start_wait_s": _number("[0, 1e9]"),
-    "env.drift.offset": _FINITE,
-    "env.drift.amplitude": _FINITE,
-    "env.drift.omega": _FINITE,
-    "env.drift.phase": _FINITE,
+    **_drift("env.drift"),
+    **_drift("env.physics.mass"),
+    **_drift("env.physics.friction"),
+    **_drift("env.physics.gravity"),
+    "env.cliff.step_reward": _FINITE,
+    "env.cliff.goal_reward": _FINITE,
+    "env.cliff.restart_reward": _FINITE,
+    "env.mdp.states": _whole(1, 10_000),
+    "env.mdp.actions": _whole(1, 1000),
+    "env.mdp.concentration": _POSITIVE,
+    "env.mdp.slip": _number("[0, 1]"),
     "env.reward.k_f": _POSITIVE,
     "env.reward.control_cost": _number("[0, inf)"),
     "env.reward.healthy": _FINITE,
@@ -128,7 +155,7 @@ RULES: dict[str, Rule] = {
     "learner.learning_starts": _whole(0),
     "learner.hidden": _each(_whole(1, 65_536), least=1),
     "learner.batch": _whole(1),
-    "learner.gamma": _number("[0, 1)"),
+    "learner.gamma": _number("[0, 1]"),  # 1: for tables whose episodes end
     "learner.tau": _number("(0, 1]"),
     "learner.actor_lr": _POSITIVE,
     "learner.critic_lr": _POSITIVE,
@@ -137,14 +164,31 @@ RULES: dict[str, Rule] = {
     "learner.target_entropy": _optional(_FINITE),
     "learner.replay_capacity": _whole(1),
     "learner.replay_units": _optional(_POSITIVE),
+    "learner.replay_recency": _optional(_POSITIVE),
     "learner.threads": _whole(1, 1024),
     "learner.schedule.l_f": _whole(1),
     "learner.schedule.gamma_f": _number("(0, 1]"),
     "learner.schedule.t_m": _each(_whole(0)),
     "learner.schedule.g_m": _each(_whole(1)),
     "learner.forecast.l_p": _whole(1),
-    "learner.forecast.horizon": _optional(_number("[0, inf)")),
+    "learner.forecast.every": _whole(1),
+    "learner.forecast.degree": _whole(1, 20),
+    "learner.forecast.period": _POSITIVE,
+    "learner.forecast.harmonics": _whole(1, 100),
+    "learner.forecast.horizon": _or_word("window", _or_word("replay", _number("[0, inf)"))),
     "learner.forecast.shrink": _number("[0, inf)"),
+    "learner.reward.speed_entry": _whole(0),
+    "learner.reward.hidden": _each(_whole(1, 65_536), least=1),
+    "learner.reward.lr": _POSITIVE,
+    "learner.reward.latent_lr": _POSITIVE,
+    "learner.table.step_size": _number("(0, 1]"),
+    "learner.table.epsilon": _number("[0, 1]"),
+    "learner.table.initial": _FINITE,
+    "learner.table.eta": _POSITIVE,
+    "learner.table.entropy": _POSITIVE,
+    "learner.table.write_back": _number("[0, 1]"),
+    "learner.table.tempo_begin": _whole(0),
+    "learner.table.tempo_span": _whole(1),
     "recorder.port": _whole(1, 65_535),
     "link.connect": _each(_ENDPOINT),
     "link.listen": _each(_ENDPOINT),
@@ -177,21 +221,36 @@ def _check_section(section: object, prefix: str) -> None:
 
 
 def _check_together(config: RunConfig) -> None:
-    env, learner, forecast = config.env, config.learner, config.learner.forecast
+    env, learner = config.env, config.learner
     if env.hz is not None:
         check_unit(env.unit_s, env.hz)
-    if forecast.kind == "forq" and forecast.basis == "identity" and forecast.l_p < 2:
-        raise ConfigError("learner.forecast.l_p", forecast.l_p, "must be >= 2 for the identity basis")
-    if learner.batch > learner.replay_capacity:
-        raise ConfigError(
-            "learner.batch",
-            learner.batch,
-            f"must be <= learner.replay_capacity, which is {learner.replay_capacity}",
-        )
-    if learner.learning_starts > learner.replay_capacity:
-        raise ConfigError(
-            "learner.learning_starts",
-            learner.learning_starts,
-            f"must be <= learner.replay_capacity, which is {learner.replay_capacity}",
-        )
+    for name in ("batch", "learning_starts"):
+        value = getattr(learner, name)
+        if value > learner.replay_capacity:
+            allowed = f"must be <= learner.replay_capacity, which is {learner.replay_capacity}"
+            raise ConfigError(f"learner.{name}", value, allowed)
+    _check_algorithm(learner)
+    _check_forecast(learner.forecast)
     make_schedule(learner.schedule)
+
+
+def _check_algorithm(learner: LearnerConfig) -> None:
+    table = learner.table
+    if learner.gamma == 1 and learner.algo not in ("q", "fq", "tempo"):
+        raise ConfigError("learner.gamma", learner.gamma, f"must be below 1 for {learner.algo}")
+    if learner.algo == "npg" and table.eta * table.entropy > 1 - learner.gamma:
+        most = (1 - learner.gamma) / table.entropy
+        allowed = f"must be <= (1 - learner.gamma) / learner.table.entropy, which is {most:g}"
+        raise ConfigError("learner.table.eta", table.eta, allowed)
+
+
+def _check_forecast(forecast: ForecastConfig) -> None:
+    columns = {
+        "constant": 1,
+        "identity": 2,
+        "polynomial": 1 + forecast.degree,
+        "fourier": 1 + 2 * forecast.harmonics,
+    }[forecast.basis]
+    if forecast.kind == "forq" and forecast.l_p < columns:
+        allowed = f"must be >= {columns} for the {forecast.basis} basis"
+        raise ConfigError("learner.forecast.l_p", forecast.l_p, allowed)

@@ -55,7 +55,10 @@ class Spec(Message, frozen=True, kw_only=True):
     action_high: list[float]
     action_delay_ticks: Count = 0
     native_period_ns: Count = 0  # simulated time per tick; 0: a world without a simulator
-    scene: str = ""  # how to draw the world: "mujoco" (with `world.mjb` in the run), "point" or ""
+    scene: str = ""  # how to draw the world: "mujoco" (with `world.mjb` in the run), "point", "grid" or ""
+    # A finite world has numbered states and actions: an observation is the state's number, an action its own.
+    states: Count = 0  # 0: observations are continuous
+    actions: Count = 0  # 0: actions are continuous
 
 
 class Step(Message, frozen=True, kw_only=True):
@@ -124,15 +127,19 @@ class Action(Message, frozen=True, kw_only=True):
 
 
 class Architecture(Message, frozen=True, kw_only=True):
-    """The network behind a policy: a ReLU MLP with two heads, mean and log standard deviation.
+    """What is behind a policy.
 
-    An action in [-1, 1] is tanh(mean + std * noise); the agent scales it to the action space.
+    tanh_gaussian_mlp: a ReLU MLP with two heads, mean and log standard deviation. An action in [-1, 1]
+    is tanh(mean + std * noise); the agent scales it to the action space.
+    categorical_table: a probability for each action in each state of a finite world.
     """
 
-    kind: Literal["tanh_gaussian_mlp"]
+    kind: Literal["tanh_gaussian_mlp", "categorical_table"]
     observation_dim: Annotated[int, msgspec.Meta(gt=0)]
     action_dim: Annotated[int, msgspec.Meta(gt=0)]
     hidden: list[int]
+    states: Count = 0  # of a table
+    actions: Count = 0
 
 
 class Policy(Message, frozen=True, kw_only=True):

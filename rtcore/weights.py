@@ -14,9 +14,12 @@ from safetensors import SafetensorError
 from safetensors import numpy as safetensors_numpy
 
 from rtcore.messages import Architecture, Policy
+from rtcore.spaces import Spaces
 
 Array = npt.NDArray[np.generic]
 Float32Array = npt.NDArray[np.float32]
+
+_SUM_TOLERANCE = 1e-4  # of a row of probabilities, in float32
 
 
 class WeightsError(ValueError):
@@ -60,9 +63,12 @@ def sha256(data: bytes) -> str:
 def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
     """Tensor name -> shape of a policy of this architecture, in the order of the forward pass.
 
-    A weight is [outputs, inputs] and a layer computes `weight @ x + bias`; ReLU follows each `trunk` layer.
-    The heads `mean` and `log_std` both read the last trunk layer (the observation, if there is none).
+    A table is `probability`, [states, actions]. A network's weight is [outputs, inputs] and a layer computes
+    `weight @ x + bias`; ReLU follows each `trunk` layer. The heads `mean` and `log_std` both read the last
+    trunk layer (the observation, if there is none).
     """
+    if architecture.kind == "categorical_table":
+        return {"probability": (architecture.states, architecture.actions)}
     shapes: dict[str, tuple[int, ...]] = {}
     inputs = architecture.observation_dim
     for layer, outputs in enumerate(architecture.hidden):
@@ -74,22 +80,32 @@ def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def verify(policy: Policy, observation_dim: int, action_dim: int) -> dict[str, Float32Array]:
-    """The weights of a policy that can act on observations [observation_dim] with actions [action_dim].
+def verify(policy: Policy, spaces: Spaces) -> dict[str, Float32Array]:
+    """The weights of a policy that can act in `spaces`.
 
     Raises:
         WeightsError: hash, dimensions, tensor names, shapes, dtype or values are wrong; says which.
     """
     if sha256(policy.weights) != policy.sha256:
         raise WeightsError("sha256 differs")
-    _check_dimension("observation_dim", policy.architecture.observation_dim, observation_dim)
-    _check_dimension("action_dim", policy.architecture.action_dim, action_dim)
+    for name in ("observation_dim", "action_dim", "states", "actions"):
+        _check_dimension(name, getattr(policy.architecture, name), getattr(spaces, name))
     if any(size < 1 for size in policy.architecture.hidden):
         raise WeightsError(f"architecture has hidden {policy.architecture.hidden}, expected sizes >= 1")
+    if spaces.finite != (policy.architecture.kind == "categorical_table"):
+        raise WeightsError(f"a {policy.architecture.kind} cannot act in this world")
     arrays = unpack(policy.weights)
     shapes = expected_shapes(policy.architecture)
     _check_names(arrays.keys(), shapes.keys())
-    return {name: _checked(name, arrays[name], shape) for name, shape in shapes.items()}
+    checked = {name: _checked(name, arrays[name], shape) for name, shape in shapes.items()}
+    if spaces.finite:
+        _check_probabilities(checked["probability"])
+    return checked
+
+
+def _check_probabilities(table: Float32Array) -> None:
+    if (table < 0).any() or (abs(table.sum(axis=1) - 1) > _SUM_TOLERANCE).any():
+        raise WeightsError("probability holds rows that are no distribution")
 
 
 def _check_dimension(name: str, policy: int, environment: int) -> None:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from env_server import worlds
+from env_server.worlds import registry as worlds
 from launcher.quantiles import Nanoseconds, Quantiles, quantiles_us
 from rtcore.config import RunConfig
 from rtcore.config_check import check

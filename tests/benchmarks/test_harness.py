@@ -23,12 +23,13 @@ from benchmarks.harness import (
 )
 from benchmarks.publish_adopt import Arguments, configure, policy_bytes
 from rtcore.realtime import Privileges, privileges
+from rtcore.spaces import Spaces
 from rtcore.weights import verify
 
 
 def test_a_random_policy_is_one_that_an_agent_takes() -> None:
     made = policy(17, 6, (32, 32))
-    arrays = verify(made, 17, 6)
+    arrays = verify(made, Spaces(17, 6))
     assert sum(array.nbytes for array in arrays.values()) == policy_bytes(17, 6, (32, 32))
 
 

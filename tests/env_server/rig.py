@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 
 from env_server.service import EnvService
-from env_server.world import World
+from env_server.worlds.world import World
 from rtcore import channels
 from rtcore.clock import VirtualClock
 from rtcore.config import EnvConfig, RunConfig

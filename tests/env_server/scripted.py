@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from env_server.world import Outcome, Position, Vector
+from env_server.worlds.world import Outcome, Position, Vector
 from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.clock import VirtualClock
@@ -20,10 +20,11 @@ class ScriptedWorld:
 
     Attributes:
         seeds: of the resets so far.
-        actions: that acted so far.
+        acted: the actions so far.
         on_step: called in each step with the number of steps so far.
     """
 
+    states = actions = 0
     observation_dim = 2
     action_dim = 1
     native_period_s: float | None = 0.05
@@ -35,7 +36,7 @@ class ScriptedWorld:
         self.action_low: Vector = np.array([-1.0], np.float32)
         self.action_high: Vector = np.array([1.0], np.float32)
         self.seeds: list[int | None] = []
-        self.actions: list[float] = []
+        self.acted: list[float] = []
         self.on_step: Callable[[int], None] = lambda _: None
         self._ends_at = ends_at
         self._breaks_at = breaks_at
@@ -48,9 +49,9 @@ class ScriptedWorld:
 
     def step(self, action: Vector, t: int, /) -> Outcome:
         self._ticks += 1
-        self.actions.append(float(action[0]))
-        self.on_step(len(self.actions))
-        first = np.nan if len(self.actions) == self._breaks_at else self._ticks
+        self.acted.append(float(action[0]))
+        self.on_step(len(self.acted))
+        first = np.nan if len(self.acted) == self._breaks_at else self._ticks
         terminated = self._ticks == self._ends_at
         observation = np.array([first, action[0]], np.float32)
         return Outcome(observation, float(t), terminated, truncated=False, drift=self.drift(t))

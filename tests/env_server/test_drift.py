@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from env_server.drift import value
+from env_server.worlds.drift import value
 from rtcore.config import DriftConfig
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from env_server.period import Timing, physics_steps, resolve_period, tick_ns
+from env_server.worlds.period import Timing, physics_steps, resolve_period, tick_ns
 from rtcore.config import ConfigError, EnvConfig
 
 CHEETAH = Timing(native_s=0.05, physics_s=0.01)

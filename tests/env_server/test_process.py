@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from env_server.worlds import resolve
+from env_server.worlds.registry import resolve
 from rtcore import channels
 from rtcore.config import AgentConfig, EnvConfig, RunConfig
 from rtcore.messages import Command, Stats, Step

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from env_server.reward import speed_reward
+from env_server.worlds.reward import speed_reward
 from rtcore.config import RewardConfig
 
 

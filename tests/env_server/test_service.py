@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from env_server.worlds import make_world, resolve
+from env_server.worlds.registry import make_world, resolve
 from rtcore import channels
 from rtcore.clock import VirtualClock
 from rtcore.config import DriftConfig, EnvConfig, RunConfig
@@ -81,14 +81,14 @@ def test_the_real_time_path_carries_the_same_steps_as_the_log() -> None:
 def test_what_acts_is_the_answer_to_the_step_before() -> None:
     world = ScriptedWorld()
     steps = Rig(run_config(duration_s=0.1), world).run()
-    assert world.actions == pytest.approx([k / 1000 for k in range(9)])
-    assert [np.frombuffer(step.action, np.float32)[0] for step in steps[1:]] == pytest.approx(world.actions)
+    assert world.acted == pytest.approx([k / 1000 for k in range(9)])
+    assert [np.frombuffer(step.action, np.float32)[0] for step in steps[1:]] == pytest.approx(world.acted)
 
 
 def test_a_delayed_action_acts_later_and_the_step_has_both() -> None:
     world = ScriptedWorld()
     steps = Rig(run_config(duration_s=0.1, action_delay_ticks=2), world).run()
-    assert world.actions == pytest.approx([0, 0, *(k / 1000 for k in range(7))])
+    assert world.acted == pytest.approx([0, 0, *(k / 1000 for k in range(7))])
     assert np.frombuffer(steps[5].action, np.float32) == pytest.approx([0.002])
     assert np.frombuffer(steps[5].decision, np.float32) == pytest.approx([0.004])
     assert steps[5].answered_tick == 4

@@ -55,7 +55,7 @@ def test_bad_actions_are_counted_and_never_act() -> None:
     rig.run(answer)
     assert rig.counts("missed", "action.invalid", "action.clipped") == [3, 3, 1]
     assert rig.causes() == {"agent_late": 3}
-    assert world.actions == pytest.approx([0, 0.001, 0.001, 0.001, 1.0, 1.0, 0.006, 0.007, 0.008])
+    assert world.acted == pytest.approx([0, 0.001, 0.001, 0.001, 1.0, 1.0, 0.006, 0.007, 0.008])
 
 
 def test_an_overrun_loses_deadlines_and_the_drift_stays_on_the_wall_clock() -> None:

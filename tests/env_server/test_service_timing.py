@@ -65,8 +65,8 @@ def test_a_fallback_decides_at_the_missed_deadline_and_acts_after_the_delay(
     assert [step.fallback for step in missed] == fallbacks
     decided = [np.frombuffer(step.decision, np.float32)[0] for step in steps[1:]]
     assert decided == pytest.approx([k / 1000 for k in thousandths])
-    assert world.actions == pytest.approx([0] * delay + [k / 1000 for k in thousandths][: 9 - delay])
-    assert [np.frombuffer(step.action, np.float32)[0] for step in steps[1:]] == pytest.approx(world.actions)
+    assert world.acted == pytest.approx([0] * delay + [k / 1000 for k in thousandths][: 9 - delay])
+    assert [np.frombuffer(step.action, np.float32)[0] for step in steps[1:]] == pytest.approx(world.acted)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
@@ -92,7 +92,7 @@ def test_a_delay_counts_executed_ticks_across_lost_deadlines() -> None:
     assert [step.skipped for step in steps] == [0, 0, 0, 0, 2, 0, 0, 1, 0]
     assert [step.woke_ns - step.due_ns for step in steps] == [0, 0, 0, 0, 5 * MS, 0, 0, 5 * MS, 0]
     assert [step.answered_tick for step in steps] == [-1, 0, 1, 2, 3, 6, 7, 8, 10]
-    assert world.actions == pytest.approx([0, 0, 0.001, 0.002, 0.003, 0.006, 0.007, 0.008])
+    assert world.acted == pytest.approx([0, 0, 0.001, 0.002, 0.003, 0.006, 0.007, 0.008])
     assert rig.counts("ticks", "overruns", "skipped", "missed") == [9, 2, 3, 0]
 
 

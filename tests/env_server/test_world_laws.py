@@ -9,10 +9,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from env_server.drift import value
-from env_server.pointmass import PointMass
-from env_server.world import Outcome, Vector, World
-from env_server.worlds import make_world
+from env_server.worlds.drift import value
+from env_server.worlds.pointmass import PointMass
+from env_server.worlds.registry import make_world
+from env_server.worlds.world import Outcome, Vector, World
 from rtcore.config import DriftConfig, EnvConfig, RewardConfig
 
 SINE = DriftConfig(kind="sine", offset=0.5, amplitude=1.0, omega=0.3)

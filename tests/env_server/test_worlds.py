@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-from env_server.gym_world import GymWorld
-from env_server.period import Timing
-from env_server.worlds import SPEED_WORLDS, make_world, resolve
+from env_server.worlds.gym_world import GymWorld
+from env_server.worlds.period import Timing
+from env_server.worlds.registry import SPEED_WORLDS, make_world, resolve
 from rtcore.config import ConfigError, DriftConfig, EnvConfig
 
 NONE = DriftConfig(kind="none")
@@ -146,7 +146,8 @@ def test_shapes_are_flattened_and_memory_is_copied() -> None:
 )
 def test_no_simulator_is_loaded_where_none_is_needed(what: str) -> None:
     code = (
-        "import sys; from env_server.worlds import make_world, resolve; from rtcore.config import EnvConfig; "
+        "import sys; from env_server.worlds.registry import make_world, resolve; "
+        "from rtcore.config import EnvConfig; "
         f"{what}; print([name for name in ('gymnasium', 'mujoco') if name in sys.modules])"
     )
     root = Path(__file__).parents[2]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from env_server.worlds import resolve
+from env_server.worlds.registry import resolve
 from launcher import options, presets
 from launcher.options import ProcessOptions, RunOptions, read
 from rtcore.config import ConfigError, RunConfig

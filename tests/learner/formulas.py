@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from learner.networks import FlatParameters
+from learner.deep.networks import FlatParameters
 
 
 def mlp(parameters: Mapping[str, Tensor], inputs: Tensor) -> Tensor:

@@ -9,7 +9,8 @@ import pytest
 from learner import checkpoint
 from learner.algorithm import Algorithm, make_algorithm
 from learner.checkpoint import CheckpointError, State
-from rtcore.config import LearnerConfig
+from rtcore.config import LearnerConfig, RunConfig
+from rtcore.spaces import Spaces
 from rtcore.windows import Window
 from tests.learner.small import ACTION_DIM, OBSERVATION_DIM, filled_replay, forq, small_config
 
@@ -20,7 +21,9 @@ def state(number: float = 1.5) -> State:
 
 
 def make(config: LearnerConfig, seed: int = 3) -> Algorithm:
-    return make_algorithm(config, OBSERVATION_DIM, ACTION_DIM, seed, filled_replay())
+    return make_algorithm(
+        RunConfig(learner=config), Spaces(OBSERVATION_DIM, ACTION_DIM), seed, filled_replay()
+    )
 
 
 def learn(student: Algorithm, units: range) -> None:

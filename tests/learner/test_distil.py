@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from learner.distil import FIRST_FITS, FIT_EVERY, Distilled
-from learner.networks import make_networks
+from learner.deep.distil import FIRST_FITS, FIT_EVERY, Distilled
+from learner.deep.networks import make_networks
 from tests.learner import formulas
 
 ROWS, ACTION, WIDTHS = 64, 2, [5, 16, 16, 1]

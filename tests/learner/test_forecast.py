@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.forecast import forq_weights
+from learner.forecast.forq import forq_weights
 
 
 def newest(length: int) -> list[int]:

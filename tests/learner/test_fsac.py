@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
 
-from learner.distil import FIRST_FITS
-from learner.fsac import Fsac
-from learner.sac import Sac
+from learner.deep.distil import FIRST_FITS
+from learner.deep.fsac import Fsac
+from learner.deep.sac import Sac
 from rtcore.config import LearnerConfig
 from rtcore.windows import Window
 from tests.learner import formulas
@@ -189,12 +191,12 @@ def test_a_unit_that_ends_again_replaces_what_came_after() -> None:
 @pytest.mark.parametrize(
     ("window", "configured", "horizon"),
     [
-        (Window(m=1, start=4, update=3, hold=2), None, 5.0),
-        (Window(m=1, start=4, update=3, hold=None), None, 3.0),
+        (Window(m=1, start=4, update=3, hold=2), "window", 5.0),
+        (Window(m=1, start=4, update=3, hold=None), "window", 3.0),
         (Window(m=1, start=4, update=3, hold=2), 12.5, 12.5),
     ],
 )
-def test_the_horizon(window: Window, configured: float | None, horizon: float) -> None:
+def test_the_horizon(window: Window, configured: float | Literal["window"], horizon: float) -> None:
     fsac = make_fsac(small_config(algo="fsac", forecast=forq(horizon=configured)))
     learn_units(fsac, range(4))
     fsac.begin_window(window, 4)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from learner.gradients import (
+from learner.deep.gradients import (
     Mlp,
     Pass,
     climb,
@@ -14,7 +14,7 @@ from learner.gradients import (
     propose,
     smaller,
 )
-from learner.networks import FlatParameters, make_networks
+from learner.deep.networks import FlatParameters, make_networks
 from tests.learner import formulas
 
 ROWS, ACTION = 12, 2

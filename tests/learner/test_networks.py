@@ -5,7 +5,14 @@ import pytest
 import torch
 from torch import nn
 
-from learner.networks import Adam, FlatParameters, make_actor, make_networks, make_twin_critic, policy_arrays
+from learner.deep.networks import (
+    Adam,
+    FlatParameters,
+    make_actor,
+    make_networks,
+    make_twin_critic,
+    policy_arrays,
+)
 from rtcore.messages import Architecture
 from rtcore.weights import expected_shapes
 from tests.learner.formulas import mlp

@@ -5,9 +5,10 @@ import pytest
 
 from learner.algorithm import make_algorithm
 from learner.arithmetic import product_type
+from learner.deep.sac import Sac
 from learner.replay import Replay
-from learner.sac import Sac
-from rtcore.config import LearnerConfig
+from rtcore.config import LearnerConfig, RunConfig
+from rtcore.spaces import Spaces
 from tests.learner.plain_sac import PlainSac, linears
 from tests.learner.small import ACTION_DIM, OBSERVATION_DIM, filled_replay, small_config
 
@@ -114,7 +115,12 @@ def test_an_empty_replay_is_refused() -> None:
 
 def test_the_configuration_names_the_algorithm() -> None:
     for algo in ("sac", "fsac"):
-        made = make_algorithm(small_config(algo=algo), OBSERVATION_DIM, ACTION_DIM, 0, filled_replay())
+        made = make_algorithm(
+            RunConfig(learner=small_config(algo=algo)),
+            Spaces(OBSERVATION_DIM, ACTION_DIM),
+            0,
+            filled_replay(),
+        )
         assert made.algo == algo
         assert made.architecture.hidden == [16, 16]
 
@@ -171,7 +177,7 @@ def test_it_learns(algo: str, precision: str) -> None:
         algo=algo, precision=precision, alpha=0.01, actor_lr=5e-3, critic_lr=5e-3, hidden=(32, 32), batch=64
     )
     rng, replay = np.random.default_rng(0), Replay(5000, 1, 1)
-    student = make_algorithm(config, 1, 1, 0, replay)
+    student = make_algorithm(RunConfig(learner=config), Spaces(1, 1), 0, replay)
     assert isinstance(student, Sac)
     untrained = mean_reward(student, replay, rng, 200)
     for _ in range(10):

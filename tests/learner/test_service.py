@@ -20,6 +20,7 @@ from rtcore.ledger import Ledger
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Command, Policy, Spec, Step, StepBatch
 from rtcore.run_dir import RunDir
+from rtcore.spaces import Spaces
 from rtcore.weights import verify
 
 TICK_NS, UNIT_NS = 100_000_000, 1_000_000_000  # ten ticks a unit
@@ -127,7 +128,7 @@ def test_it_publishes_one_iterate_a_unit_in_update_phases_only(rig: Rig) -> None
     phases = [(n.message.window, n.message.phase, n.message.at_ns // UNIT_NS) for n in rig.windows.drain()]
     assert phases == [(0, "update", 0), (0, "hold", 2), (1, "update", 4), (1, "hold", 6)]
     for policy in policies:
-        verify(policy, SPEC.observation_dim, SPEC.action_dim)
+        verify(policy, Spaces.of(SPEC))
     assert rig.ledger.counter("published_in_hold") == 0
 
 

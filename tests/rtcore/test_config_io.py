@@ -80,7 +80,7 @@ def test_any_configuration_survives_the_round_trip(config: RunConfig) -> None:
 
 def test_what_is_none_is_left_out(tmp_path: Path) -> None:
     text = dump_toml(RunConfig())
-    assert "hz" not in text and "horizon" not in text and "None" not in text
+    assert "hz" not in text and "replay_units" not in text and "None" not in text
     assert "on_miss" in text  # while a default that is not None is there
     assert load_text(tmp_path, text).env.hz is None
 

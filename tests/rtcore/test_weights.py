@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rtcore.messages import Architecture, Policy
+from rtcore.spaces import Spaces
 from rtcore.weights import WeightsError, expected_shapes, pack, sha256, unpack, verify
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -57,7 +58,7 @@ def test_the_tensors_of_an_architecture() -> None:
 def test_a_good_policy_comes_through_the_wire() -> None:
     arrays = weights()
     received = msgspec.msgpack.decode(msgspec.msgpack.encode(policy(arrays)), type=Policy)
-    verified = verify(received, 17, 6)
+    verified = verify(received, Spaces(17, 6))
     assert list(verified) == list(expected_shapes(ARCHITECTURE))
     for name, array in verified.items():
         assert array.dtype == np.float32
@@ -134,23 +135,23 @@ def poisoned(name: str, value: float) -> Callable[[Arrays], Arrays]:
 )  # fmt: skip
 def test_wrong_weights_are_refused_with_the_reason(change: Callable[[Arrays], Arrays], reason: str) -> None:
     with pytest.raises(WeightsError) as error:
-        verify(policy(change(weights())), 17, 6)
+        verify(policy(change(weights())), Spaces(17, 6))
     assert str(error.value) == reason
 
 
 def test_many_strange_tensors_are_listed_briefly() -> None:
     strange = {f"x{number:03}" + "y" * 200: zeros(1) for number in range(100)}
     with pytest.raises(WeightsError, match=r"^extra tensors: x000y+, .* and 92 more$") as error:
-        verify(policy(weights() | strange), 17, 6)
+        verify(policy(weights() | strange), Spaces(17, 6))
     assert len(str(error.value)) < 800
 
 
 def test_a_policy_for_another_world_is_refused() -> None:
     good = policy(weights())
     with pytest.raises(WeightsError, match=r"^architecture has observation_dim 17, the environment has 23$"):
-        verify(good, 23, 6)
+        verify(good, Spaces(23, 6))
     with pytest.raises(WeightsError, match=r"^architecture has action_dim 6, the environment has 1$"):
-        verify(good, 17, 1)
+        verify(good, Spaces(17, 1))
 
 
 def test_a_changed_byte_is_seen() -> None:
@@ -158,15 +159,15 @@ def test_a_changed_byte_is_seen() -> None:
     changed = bytearray(good.weights)
     changed[-1] ^= 1
     with pytest.raises(WeightsError, match=r"^sha256 differs$"):
-        verify(msgspec.structs.replace(good, weights=bytes(changed)), 17, 6)
+        verify(msgspec.structs.replace(good, weights=bytes(changed)), Spaces(17, 6))
     with pytest.raises(WeightsError, match=r"^sha256 differs$"):
-        verify(policy(weights(), digest="0" * 64), 17, 6)
+        verify(policy(weights(), digest="0" * 64), Spaces(17, 6))
 
 
 def test_layers_without_units_are_refused() -> None:
     odd = msgspec.structs.replace(ARCHITECTURE, hidden=[64, 0])
     with pytest.raises(WeightsError, match=r"^architecture has hidden \[64, 0\], expected sizes >= 1$"):
-        verify(policy(weights(), odd), 17, 6)
+        verify(policy(weights(), odd), Spaces(17, 6))
 
 
 def framed(header: bytes, body: bytes = b"") -> bytes:
@@ -194,7 +195,7 @@ def test_other_bytes_are_refused(data: bytes, reason: str) -> None:
         unpack(data)
     good = policy(weights())
     with pytest.raises(WeightsError, match=reason):
-        verify(msgspec.structs.replace(good, weights=data, sha256=sha256(data)), 17, 6)
+        verify(msgspec.structs.replace(good, weights=data, sha256=sha256(data)), Spaces(17, 6))
 
 
 @given(st.binary(max_size=200), st.booleans())

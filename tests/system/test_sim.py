@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import safetensors.numpy
 
-from env_server.worlds import resolve
+from env_server.worlds.registry import resolve
 from experiments.presets import pointmass
 from launcher.sim import simulate
 from launcher.summary import Summary, discrepancies, summarise

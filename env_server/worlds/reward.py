@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from env_server.world import Vector
+from env_server.worlds.world import Vector
 from rtcore.config import RewardConfig
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from env_server.drift import value
-from env_server.period import Timing
-from env_server.reward import speed_reward
-from env_server.world import Outcome, Position, Vector
+from env_server.worlds.drift import value
+from env_server.worlds.period import Timing
+from env_server.worlds.reward import speed_reward
+from env_server.worlds.world import Outcome, Position, Vector
 from rtcore.config import DriftConfig, RewardConfig
 
 _PERIOD_S = 0.05
@@ -29,6 +29,7 @@ _START_SPEED = 0.1  # the first speed is uniform within plus or minus this, m/s
 class PointMass:
     """The `pointmass` world: observation [v] in m/s, action [a] in [-1, 1]."""
 
+    states = actions = 0
     observation_dim = 1
     action_dim = 1
     native_period_s: float | None = TIMING.native_s

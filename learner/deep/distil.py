@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from learner.gradients import Mlp, Pass
-from learner.networks import Adam, FlatParameters, make_networks
+from learner.deep.gradients import Mlp, Pass
+from learner.deep.networks import Adam, FlatParameters, make_networks
 
 FIRST_FITS = 32  # policy steps that are exact at a window's start; ten were enough for the error above
 FIT_EVERY = 16  # afterwards; at l_p = 10 an exact step costs five to six plain ones

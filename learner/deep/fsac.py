@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.checkpoint import State
-from learner.critic_history import CriticHistory, Snapshot
-from learner.distil import Distilled
-from learner.forecast import forq_weights
-from learner.gradients import Pass, climb, smaller
-from learner.networks import Adam, FlatParameters
+from learner.deep.critic_history import CriticHistory, Snapshot
+from learner.deep.distil import Distilled
+from learner.deep.gradients import Pass, climb, smaller
+from learner.deep.networks import Adam, FlatParameters
+from learner.deep.sac import Sac
+from learner.forecast.forq import forq_weights
 from learner.replay import Replay
-from learner.sac import Sac
 from rtcore.config import LearnerConfig
 from rtcore.windows import Window
 
@@ -119,9 +119,9 @@ class Fsac(Sac):
         snapshots = self._history.snapshots
         if config.kind == "none" or not snapshots:
             return
-        horizon = config.horizon
-        if horizon is None:  # a window without an end has only its update phase for a length
-            horizon = float(window.update if window.hold is None else window.update + window.hold)
+        # a window without an end has only its update phase for a length
+        length = float(window.update if window.hold is None else window.update + window.hold)
+        horizon = config.horizon if isinstance(config.horizon, float | int) else length
         times = [snapshot.time - window.start for snapshot in snapshots]
         weights = forq_weights(times, horizon, basis=config.basis, shrink=config.shrink)
         self._forecast = forecast = Forecast(window, horizon, tuple(weights.tolist()), snapshots)

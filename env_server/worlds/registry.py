@@ -5,8 +5,8 @@ Importing this module loads no simulator; each world's own module is imported wh
 
 from __future__ import annotations
 
-from env_server.period import Timing, physics_steps, resolve_period
-from env_server.world import World
+from env_server.worlds.period import Timing, physics_steps, resolve_period
+from env_server.worlds.world import World
 from rtcore import channels
 from rtcore.config import ConfigError, EnvConfig
 
@@ -49,10 +49,10 @@ def make_world(env: EnvConfig, seed: int) -> World:
         return _gym_world(env, seed, _frame_skip(env, timing))
     steps = physics_steps(env, timing)
     if env.id == POINTMASS:
-        from env_server.pointmass import PointMass
+        from env_server.worlds.pointmass import PointMass
 
         return PointMass(env.drift, env.reward, seed=seed, steps=steps)
-    from env_server.mujoco_speed import SpeedWorld
+    from env_server.worlds.mujoco_speed import SpeedWorld
 
     return SpeedWorld(env.id, env.drift, env.reward, timing=timing, steps=steps, seed=seed)
 
@@ -76,7 +76,7 @@ def _chases_speed(env: EnvConfig) -> bool:
 
 def _timing(env: EnvConfig) -> Timing:
     if env.id == POINTMASS:
-        from env_server.pointmass import TIMING
+        from env_server.worlds.pointmass import TIMING
 
         return TIMING
     if _chases_speed(env):
@@ -100,7 +100,7 @@ def _inspect(env: EnvConfig, frame_skip: int | None) -> Timing:
 
 
 def _gym_world(env: EnvConfig, seed: int, frame_skip: int | None) -> World:
-    from env_server.gym_world import GymWorld
+    from env_server.worlds.gym_world import GymWorld
 
     try:
         return GymWorld(env.id, seed=seed, frame_skip=frame_skip)

@@ -1,6 +1,6 @@
 """Any Gymnasium environment with continuous observations and actions, as a world.
 
-Imports gymnasium, and MuJoCo where the environment is a MuJoCo one: `env_server.worlds` loads this
+Imports gymnasium, and MuJoCo where the environment is a MuJoCo one: `env_server.worlds.registry` loads this
 module only for the worlds that need it.
 """
 
@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
-from env_server.world import Outcome, Position, Vector
+from env_server.worlds.world import Outcome, Position, Vector
 from rtcore.config import ConfigError
 
 _LOG = logging.getLogger(__name__)
@@ -27,6 +27,8 @@ class GymWorld:
 
     Observations and actions are flattened to float32 vectors.
     """
+
+    states = actions = 0
 
     def __init__(self, env_id: str, *, seed: int, frame_skip: int | None = None) -> None:
         """Builds the environment.

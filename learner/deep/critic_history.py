@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from learner.gradients import Mlp
-from learner.networks import FlatParameters
+from learner.deep.gradients import Mlp
+from learner.deep.networks import FlatParameters
 
 
 class Snapshot:

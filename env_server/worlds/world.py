@@ -37,7 +37,19 @@ class Outcome:
 
 
 class World(Protocol):
-    """A simulated world with continuous observations and actions, stepped by somebody else's clock."""
+    """A simulated world, stepped by somebody else's clock.
+
+    In a finite one states and actions are numbered: an observation is the state's number, an action its
+    own, each as one float32.
+    """
+
+    @property
+    def states(self) -> int:
+        """How many there are; 0: observations are continuous."""
+
+    @property
+    def actions(self) -> int:
+        """How many there are; 0: actions are continuous. Both are 0, or neither is."""
 
     @property
     def observation_dim(self) -> int:
@@ -65,7 +77,7 @@ class World(Protocol):
 
     @property
     def scene(self) -> str:
-        """How to draw it: "mujoco" (`save_scene` writes the model), "point", or "" for not at all."""
+        """How to draw it: "mujoco" (`save_scene` writes the model), "point", "grid", or "" for not at all."""
 
     def reset(self, seed: int | None, t: int, /) -> Vector:
         """Begin an episode in unit `t`.

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from learner.arithmetic import product_type
 from learner.checkpoint import State, require_fit
-from learner.gradients import (
+from learner.deep.gradients import (
     Mlp,
     Pass,
     Proposal,
@@ -28,9 +28,9 @@ from learner.gradients import (
     propose,
     smaller,
 )
-from learner.networks import Adam, FlatParameters, make_actor, make_twin_critic, policy_arrays
+from learner.deep.networks import Adam, FlatParameters, make_actor, make_twin_critic, policy_arrays
+from learner.deep.tensors import BatchTensors
 from learner.replay import Replay, make_batch
-from learner.tensors import BatchTensors
 from rtcore.config import LearnerConfig
 from rtcore.messages import Architecture
 from rtcore.windows import Window
@@ -206,6 +206,11 @@ class Sac:
     def _climb(self) -> tuple[Tensor, Tensor]:
         """The Q that the policy climbs at (s, a) of the pass, [B], and its gradient in a, [B, A]."""
         return climb(self._values, self._critic_net, self.architecture.action_dim)
+
+    def iterate(self, g: int) -> bool:
+        """SAC improves its policy by `update`."""
+        del g
+        return False
 
     def begin_window(self, window: Window, unit: int) -> None:
         """SAC makes no forecast."""

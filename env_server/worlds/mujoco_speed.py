@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from env_server.drift import value
-from env_server.gym_world import GymWorld
-from env_server.period import Timing
-from env_server.reward import speed_reward
-from env_server.world import Outcome, Position, Vector
+from env_server.worlds.drift import value
+from env_server.worlds.gym_world import GymWorld
+from env_server.worlds.period import Timing
+from env_server.worlds.reward import speed_reward
+from env_server.worlds.world import Outcome, Position, Vector
 from rtcore.config import DriftConfig, RewardConfig
 
 
@@ -19,6 +19,7 @@ class SpeedWorld:
     moves forward is the first of qpos, in metres.
     """
 
+    states = actions = 0
     physics_step_s: float | None
     native_period_s: float | None
     scene = "mujoco"
@@ -33,7 +34,7 @@ class SpeedWorld:
         steps: int,
         seed: int,
     ) -> None:
-        """`steps` physics steps pass per tick; `timing` is the world's own, from `env_server.worlds`."""
+        """`steps` physics steps pass per tick; `timing` is the world's own, from the registry."""
         self._world = GymWorld(env_id, seed=seed, frame_skip=steps)
         self._drift = drift
         self._reward = reward

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from learner.networks import FlatParameters
+from learner.deep.networks import FlatParameters
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 

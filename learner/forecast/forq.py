@@ -10,12 +10,11 @@ inverse with the shapes the other way round.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Basis = Literal["constant", "identity"]
+from rtcore.config import Basis
 
 
 def forq_weights(

@@ -1,0 +1,1 @@
+"""Students with neural networks: soft actor-critic and what builds on it."""

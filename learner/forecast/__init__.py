@@ -1,0 +1,1 @@
+"""Forecasts: of a Q function, of a drift, and how far they can be trusted."""

@@ -1,0 +1,1 @@
+"""Students with tables: finite states and actions."""
