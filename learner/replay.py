@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
-_SCHEMA = 1
+_SCHEMA = 2  # 1: without the number of transitions ever added
 _CURSOR = "cursor.json"
 
 
@@ -65,6 +65,7 @@ class Replay:
     that was there before, see `open_replay`. Its length is the number of transitions held.
 
     Attributes:
+        added: transitions ever added; they are numbered from 0, so the newest is `added` - 1.
         raised_units: transitions that came with an older unit than their predecessor's and were
             filed under the newest one, so that units rise with insertion.
     """
@@ -76,17 +77,18 @@ class Replay:
         self._head = 0  # where the next transition goes
         self._size = 0
         self._directory: Path | None = None
+        self.added = 0
         self.raised_units = 0
 
     def __len__(self) -> int:
         return self._size
 
     @classmethod
-    def over(cls, columns: Columns, head: int, size: int, directory: Path) -> Replay:
+    def over(cls, columns: Columns, head: int, size: int, added: int, directory: Path) -> Replay:
         """A replay over arrays that are mapped from files in `directory`."""
         replay = cls(len(columns.reward), columns.observation.shape[1], columns.action.shape[1])
         replay._columns, replay._head, replay._size = columns, head, size
-        replay._directory = directory
+        replay._directory, replay.added = directory, added
         return replay
 
     @property
@@ -116,6 +118,21 @@ class Replay:
         columns.unit[row] = unit
         self._head = (row + 1) % self.capacity
         self._size = min(self._size + 1, self.capacity)
+        self.added += 1
+
+    def read(self, start: int, limit: int) -> Columns:
+        """Copies of the transitions numbered `start` and on, oldest first, at most `limit` of them.
+
+        Those that were overwritten meanwhile are missing: it begins with `start` or with the oldest held,
+        number `added` - len(self), whichever is newer.
+        """
+        first = max(start, self.added - self._size)
+        rows = np.arange(first, min(first + limit, self.added)) + (self._head - self.added)
+        taken = {
+            column.name: np.take(getattr(self._columns, column.name), rows, axis=0, mode="wrap")
+            for column in fields(self._columns)
+        }
+        return Columns(**taken)
 
     def count_since(self, unit: int) -> int:
         """How many of the newest transitions belong to `unit` or later."""
@@ -168,6 +185,7 @@ class Replay:
             **_shape(self.capacity, self.observation_dim, self.action_dim),
             "head": self._head,
             "size": self._size,
+            "added": self.added,
         }
         temporary = self._directory / f"{_CURSOR}.new"
         temporary.write_text(json.dumps(cursor))
@@ -182,7 +200,7 @@ def open_replay(directory: Path, capacity: int, observation_dim: int, action_dim
     """
     directory.mkdir(parents=True, exist_ok=True)
     wanted = _shape(capacity, observation_dim, action_dim)
-    head, size = _read_cursor(directory, wanted)
+    head, size, added = _read_cursor(directory, wanted)
     columns = {}
     for name, (shape, dtype) in _layout(capacity, observation_dim, action_dim).items():
         path = directory / f"{name}.bin"
@@ -190,15 +208,15 @@ def open_replay(directory: Path, capacity: int, observation_dim: int, action_dim
             raise ReplayError(f"{path}: missing")
         mapped = np.memmap(path, dtype, "r+" if size else "w+", shape=shape)
         columns[name] = np.asarray(mapped)  # a plain view: indexing a memmap object is slower
-    return Replay.over(Columns(**columns), head, size, directory)
+    return Replay.over(Columns(**columns), head, size, added, directory)
 
 
-def _read_cursor(directory: Path, wanted: dict[str, int]) -> tuple[int, int]:
+def _read_cursor(directory: Path, wanted: dict[str, int]) -> tuple[int, int, int]:
     try:
         found = json.loads((directory / _CURSOR).read_text())
-        head, size = int(found["head"]), int(found["size"])
+        head, size, added = int(found["head"]), int(found["size"]), int(found.get("added", 0))
     except FileNotFoundError:
-        return 0, 0
+        return 0, 0, 0
     except (ValueError, KeyError, TypeError) as error:
         raise ReplayError(f"{directory / _CURSOR}: not readable ({error})") from None
     differences = [
@@ -206,9 +224,9 @@ def _read_cursor(directory: Path, wanted: dict[str, int]) -> tuple[int, int]:
     ]
     if differences:
         raise ReplayError(f"{directory}: {', '.join(differences)}")
-    if not (0 <= size <= wanted["capacity"] and 0 <= head < wanted["capacity"]):
-        raise ReplayError(f"{directory / _CURSOR}: head {head} and size {size} are outside the ring")
-    return head, size
+    if not (0 <= size <= wanted["capacity"] and 0 <= head < wanted["capacity"] and size <= added):
+        raise ReplayError(f"{directory / _CURSOR}: head {head}, size {size}, added {added}: outside the ring")
+    return head, size, added
 
 
 def _shape(capacity: int, observation_dim: int, action_dim: int) -> dict[str, int]:

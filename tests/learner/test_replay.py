@@ -142,3 +142,27 @@ def test_a_damaged_replay_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cursor.json").write_text("{")
     with pytest.raises(ReplayError, match="not readable"):
         open_replay(tmp_path, 4, 2, 1)
+
+
+def test_transitions_are_read_by_number_across_the_rings_end() -> None:
+    replay = Replay(4, 1, 1)
+    for number in range(6):  # 0 and 1 are overwritten; the ring wraps between 3 and 4
+        value = np.array([number], np.float32)
+        replay.add(value, value, float(number), value, False, number)
+    assert replay.added == 6
+    assert replay.read(3, 2).reward.tolist() == [3.0, 4.0]
+    assert replay.read(5, 9).reward.tolist() == [5.0]
+    assert replay.read(0, 3).reward.tolist() == [2.0, 3.0, 4.0]  # begins with the oldest held
+    assert replay.read(6, 3).reward.tolist() == []
+    assert replay.read(2, 9).unit.tolist() == [2, 3, 4, 5]
+
+
+def test_the_numbers_go_on_in_a_replay_that_was_there_before(tmp_path: Path) -> None:
+    value = np.zeros(1, np.float32)
+    replay = open_replay(tmp_path, 2, 1, 1)
+    for number in range(5):
+        replay.add(value, value, float(number), value, False, 0)
+    replay.flush()
+    again = open_replay(tmp_path, 2, 1, 1)
+    assert again.added == 5
+    assert again.read(3, 9).reward.tolist() == [3.0, 4.0]
