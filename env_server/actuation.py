@@ -24,7 +24,10 @@ _CLIP_TOLERANCE = 1e-6  # of the range: what float32 scaling of [-1, 1] may over
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """What `Actuation` obeys; the first four fields are those of `EnvConfig`."""
+    """What `Actuation` obeys; the first four fields are those of `EnvConfig`, the last but one the world's.
+
+    An action is neutral that is zero, or as near to it as the bounds allow: in a finite world action 0.
+    """
 
     on_miss: MissPolicy
     hold_ticks: int
@@ -32,6 +35,7 @@ class Rules:
     observe_actions: int
     low: Vector
     high: Vector
+    actions: int = 0  # of a finite world; 0: continuous
     incarnation: int
 
     @staticmethod
@@ -44,6 +48,7 @@ class Rules:
             observe_actions=env.observe_actions,
             low=world.action_low,
             high=world.action_high,
+            actions=world.actions,
             incarnation=incarnation,
         )
 
@@ -163,12 +168,18 @@ class Actuation:
         if newest.tick > expected_tick or len(newest.values) != rules.low.nbytes:
             return "invalid", None, False
         wanted = np.frombuffer(newest.values, "<f4").astype(np.float32)
-        if not np.isfinite(wanted).all():
+        if not (np.isfinite(wanted).all() and self._exists(wanted)):
             return "invalid", None, False
         values = np.clip(wanted, rules.low, rules.high)
         values.setflags(write=False)
         clipped = bool((np.abs(wanted - values) > _CLIP_TOLERANCE * (rules.high - rules.low)).any())
         return "answer", _Choice(values, newest.policy_version, newest.tick), clipped
+
+    def _exists(self, wanted: Vector) -> bool:
+        """Whether a finite world has this action. There is nothing to clip: the nearest number is any other
+        action."""
+        actions = self._rules.actions
+        return actions == 0 or bool(((wanted >= 0) & (wanted < actions) & (wanted == np.floor(wanted))).all())
 
     def _fall_back(self) -> tuple[Fallback, _Choice]:
         rules = self._rules

@@ -12,6 +12,7 @@ import numpy as np
 
 from env_server.actuation import Actuation, Decision, Verdict
 from env_server.worlds.world import Outcome, Vector, World
+from rtcore.config import Notify
 from rtcore.messages import Action
 
 WORLD_STREAM = 0  # keeps the world's random numbers apart from the agent's and the learner's
@@ -22,11 +23,13 @@ class Turn:
     """What one tick came to.
 
     Attributes:
-        observation: float32 [observation_dim], observed actions included.
+        observation: float32 [observation_dim]: the world's, what is told of the drift (`notify`: no number
+            or one), then the observed actions.
         reward: earned over the tick; 0 at a reset.
         terminated: the task ended.
         truncated: only the time limit, or a broken world, ended the episode.
         drift: the drift's true value.
+        physics: the factors on mass, friction and gravity; empty where none drifts.
         episode: index, from 0.
         episode_tick: ticks since the reset, 0 at it.
         verdict: what became of the newest message.
@@ -40,6 +43,7 @@ class Turn:
     terminated: bool
     truncated: bool
     drift: float
+    physics: tuple[float, ...]
     episode: int
     episode_tick: int
     verdict: Verdict
@@ -51,8 +55,11 @@ class Turn:
 class Rollout:
     """Turns a world through its episodes, tick by tick."""
 
-    def __init__(self, world: World, actuation: Actuation, *, episode_steps: int, seed: int) -> None:
+    def __init__(
+        self, world: World, actuation: Actuation, *, episode_steps: int, seed: int, notify: Notify = "none"
+    ) -> None:
         self._world = world
+        self._notify = notify
         self._actuation = actuation
         self._episode_steps = episode_steps
         self._seed = seed
@@ -79,11 +86,12 @@ class Rollout:
         over = outcome.truncated or self._episode_tick >= self._episode_steps
         self._ended = outcome.terminated or over
         return Turn(
-            observation=self._actuation.observed(outcome.observation),
+            observation=self._observed(outcome.observation, t),
             reward=outcome.reward,
             terminated=outcome.terminated,
             truncated=over and not outcome.terminated,
             drift=outcome.drift,
+            physics=self._world.physics(t),
             episode=self._episode,
             episode_tick=self._episode_tick,
             verdict=decision.verdict,
@@ -105,11 +113,12 @@ class Rollout:
             observation = np.zeros_like(observation)
         self._last_good = observation
         return Turn(
-            observation=self._actuation.observed(observation),
+            observation=self._observed(observation, t),
             reward=0.0,
             terminated=False,
             truncated=False,
             drift=self._world.drift(t),
+            physics=self._world.physics(t),
             episode=self._episode,
             episode_tick=0,
             verdict=verdict,
@@ -117,3 +126,22 @@ class Rollout:
             episode_return=None,
             broken=broken,
         )
+
+    def _observed(self, observation: Vector, t: int) -> Vector:
+        if self._notify != "none":
+            observation = np.append(observation, np.float32(told(self._world, self._notify, t)))
+        return self._actuation.observed(observation)
+
+
+def told(world: World, notify: Notify, t: int) -> float:
+    """The number that tells an agent in unit `t` of the drift, where it may know.
+
+    "changed": 1 throughout a unit whose target or physics differ from the unit's before, else 0; NS-Gym calls
+    that change notification. "value": the target itself, so that its change is known too (NS-Gym's delta
+    change notification tells how much changed).
+    """
+    if notify == "value":
+        return world.drift(t)
+    if t == 0:
+        return 0.0
+    return float((world.drift(t), world.physics(t)) != (world.drift(t - 1), world.physics(t - 1)))

@@ -96,7 +96,9 @@ class EnvService:
         self._tick_ns = tick_ns(env)
         self._unit_ns = unit_ns(env)
         rules = Rules.of(env, world, incarnation=incarnation)
-        self._rollout = Rollout(world, Actuation(rules), episode_steps=env.episode_steps, seed=config.seed)
+        self._rollout = Rollout(
+            world, Actuation(rules), episode_steps=env.episode_steps, seed=config.seed, notify=env.notify
+        )
         self._specs = bus.publisher(channels.SPEC, env.name)
         self._steps = bus.publisher(channels.STEP, env.name)
         self._actions = bus.queue(channels.ACTION, env.name, capacity=ACTIONS_KEPT)

@@ -36,7 +36,7 @@ def word_spec(
         wall_t0_ns=wall_t0_ns,
         tick_ns=tick_ns,
         unit_ns=unit_ns(env),
-        observation_dim=world.observation_dim + env.observe_actions * world.action_dim,
+        observation_dim=observation_dim(env, world),
         action_dim=world.action_dim,
         action_low=world.action_low.tolist(),
         action_high=world.action_high.tolist(),
@@ -81,7 +81,13 @@ def word_step(stamp: Stamp, tick: Tick, turn: Turn, latency: Latency, position: 
         late_reaction_ns=late.reaction_ns,
         drift=turn.drift,
         position=position.astype("<f8").tobytes(),
+        physics=list(turn.physics),
     )
+
+
+def observation_dim(env: EnvConfig, world: World) -> int:
+    """Numbers in a step's observation: the world's, one if `notify` tells of the drift, observed actions."""
+    return world.observation_dim + (env.notify != "none") + env.observe_actions * world.action_dim
 
 
 def unit_ns(env: EnvConfig) -> int:

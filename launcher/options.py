@@ -94,11 +94,16 @@ def read(
         base = presets.load(presets.DEFAULT)
     default = _as_options(kind, base, argv)
     options = parse(kind, argv, prog=prog, description=description, default=default)
-    config = _as_config(options, default, base.preset)
+    return _resolved(_as_config(options, default, base.preset)), options
+
+
+def _resolved(config: RunConfig) -> RunConfig:
+    """Checked, with `hz` and `speed` both filled in."""
+    worlds.require_fit(config.env, config.learner.algo)  # first: rules of an algorithm are beside the point
     check(config)
     resolved = replace(config, env=worlds.resolve(config.env))
     check(resolved)  # again, now that hz and speed are both known
-    return resolved, options
+    return resolved
 
 
 def describe(summary: str) -> str:

@@ -3,41 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 
-from rtcore.config import DriftConfig, LearnerConfig, RunConfig, ScheduleConfig
+from recorder.student import student_rows
+from rtcore.config import DriftConfig, DriftKind, EnvConfig, RunConfig
 from rtcore.messages import Spec
 
 
 def run_card(run: str, config: RunConfig, spec: Spec, placements: Mapping[str, str]) -> str:
     """Markdown. `placements` says per process what the system granted it."""
-    learner = config.learner
     world = [
-        ("environment", f"`{spec.env_id}` ({spec.observation_dim} observations, {spec.action_dim} actions)"),
+        ("environment", f"`{spec.env_id}` ({_spaces(spec)})"),
         ("rate", _rate(spec)),
         ("episode", f"{config.env.episode_steps} ticks"),
         ("unit t", f"{spec.unit_ns / 1e9:g} s"),
-        ("drift", _drift(config.env.drift)),
+        *_changes(config.env),
         ("action delay", f"{spec.action_delay_ticks} ticks"),
         ("on a miss", config.env.on_miss),
     ]
-    student = [
-        ("algorithm", f"`{learner.algo}`, hidden {list(learner.hidden)}, batch {learner.batch}"),
-        (
-            "learning rate",
-            f"actor {learner.actor_lr:g}, critic {learner.critic_lr:g}, gamma {learner.gamma:g}",
-        ),
-        ("updates", f"at most {learner.utd:g} per transition, from {learner.learning_starts} transitions on"),
-        ("schedule", _schedule(learner.schedule)),
-        ("in the hold", f"critics learn: {learner.hold_learning}"),
-        ("forecast", _forecast(learner)),
-    ]
     duration = f"{config.duration_s:g} s" if config.duration_s else "until stopped"
     head = [("preset", f"`{config.preset}`"), ("seed", str(config.seed)), ("duration", duration)]
-    page = [f"# {run}", _table(head), "## World", _table(world), "## Learner", _table(student)]
+    page = [
+        f"# {run}",
+        _table(head),
+        "## World",
+        _table(world),
+        "## Learner",
+        _table(student_rows(config.learner)),
+    ]
     if placements:
         page += ["## Placement", _table(sorted(placements.items()))]
     return "\n\n".join(page) + "\n"
+
+
+def _spaces(spec: Spec) -> str:
+    if spec.states:
+        return f"{spec.states} states, {spec.actions} actions"
+    return f"{spec.observation_dim} observations, {spec.action_dim} actions"
 
 
 def _rate(spec: Spec) -> str:
@@ -47,38 +48,46 @@ def _rate(spec: Spec) -> str:
     return f"{rate}; {spec.native_period_ns / spec.tick_ns:g} x native speed"
 
 
+def _changes(env: EnvConfig) -> list[tuple[str, str]]:
+    """What drifts, and what the agent is told of it."""
+    factors = {name: getattr(env.physics, name) for name in ("mass", "friction", "gravity")}
+    drifting = [
+        (f"factor on {name}", _drift(drift)) for name, drift in factors.items() if drift.kind != "none"
+    ]
+    told = {"none": [], "changed": [("told", "when it changes")], "value": [("told", "the drift's value")]}
+    return [("drift", _drift(env.drift)), *drifting, *told[env.notify]]
+
+
 def _drift(drift: DriftConfig) -> str:
-    match drift.kind:
-        case "none":
-            return "none"
-        case "constant":
-            return f"constant {drift.offset:g}"
-        case "sine":
-            phase = f" + {drift.phase:g}" if drift.phase else ""
-            return f"{drift.offset:g} + {drift.amplitude:g} sin({drift.omega:g} t{phase})"
-        case _:
-            plain, given = asdict(DriftConfig(kind=drift.kind)), asdict(drift)
-            return ", ".join(
-                [drift.kind, *(f"{name} {value}" for name, value in given.items() if value != plain[name])]
-            )
-
-
-def _schedule(schedule: ScheduleConfig) -> str:
-    match schedule.kind:
-        case "fixed":
-            share = f"{schedule.gamma_f:g} ({schedule.rounding}) of each for updates"
-            return f"fixed: windows of {schedule.l_f} units, {share}"
-        case "explicit":
-            return f"explicit: starts {list(schedule.t_m)}, updates {list(schedule.g_m)} units"
-
-
-def _forecast(learner: LearnerConfig) -> str:
-    forecast = learner.forecast
-    if learner.algo == "sac" or forecast.kind == "none":
+    if drift.kind == "none":
         return "none"
-    words = {"window": "the window", "replay": "the window and the replay's age"}
-    horizon = words.get(str(forecast.horizon)) or f"{forecast.horizon} units"
-    return f"{forecast.kind}, {forecast.l_p} past critics, basis {forecast.basis}, horizon {horizon}"
+    bounds = [f"at least {drift.low:g}"] if drift.low is not None else []
+    bounds += [f"at most {drift.high:g}"] if drift.high is not None else []
+    own_seed = [f"seed {drift.seed}"] if drift.seed is not None else []
+    return ", ".join([_formula(drift), *bounds, *own_seed])
+
+
+def _formula(drift: DriftConfig) -> str:
+    """A kind's value in unit t, in words."""
+    rest, other, sd = f"{drift.offset:g}", f"{drift.offset + drift.amplitude:g}", f"{drift.sd:g}"
+    at = f"a random unit below {drift.span:g}" if drift.at == "random" else f"t = {drift.at:g}"
+    wave = f"sin({drift.omega:g} t{f' + {drift.phase:g}' if drift.phase else ''})"
+    again = f"every {drift.every:g} units"
+    words: dict[DriftKind, str] = {
+        "constant": f"constant {rest}",
+        "sine": f"{rest} + {drift.amplitude:g} {wave}",
+        "square": f"{rest} + {drift.amplitude:g} sgn({wave})",
+        "ramp": f"ramp from {rest} to {other}, over {drift.span:g} units from {at}",
+        "switch": f"switch from {rest} to {other} at {at}"
+        + (f", back and forth {again}" if drift.every else ""),
+        "burst": f"{rest}, but {other} for {drift.span:g} units from {at}"
+        + (f", {again}" if drift.every else ""),
+        "random_walk": f"random walk from {rest}, steps of sd {sd}",
+        "ou": f"Ornstein-Uhlenbeck around {rest}, pulled by {drift.rate:g} per unit, steps of sd {sd}",
+        "noise": f"noise around {rest}, sd {sd}",
+        "recorded": f"recorded in `{drift.path}`",
+    }
+    return words[drift.kind]
 
 
 def _table(rows: Iterable[tuple[str, str]]) -> str:

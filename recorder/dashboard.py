@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from recorder.scene import FOLLOW, ROOT, Camera
 from recorder.telemetry import FORECAST
-from recorder.ticks import MISSED
+from recorder.ticks import MISSED, PHYSICS
 from rtcore.messages import CAUSES, Spec
 
 LIVE_WINDOW_S = 30.0
@@ -76,7 +76,7 @@ def _middle(plots: _Plots, *, drift_is_speed: bool) -> list[Any]:
         plots.states("Learner's phase", "/learner/phase"),
         plots.lines("Drifting target and speed reached, m/s", "/env/drift", legend=True)
         if drift_is_speed
-        else plots.lines("Drift", "/env/drift"),
+        else plots.lines("Drift", "/env/drift", PHYSICS, legend=True),
         plots.lines("Return per episode", "/env/return"),
         plots.lines("Reward per tick", "/env/reward"),
     ]
@@ -92,7 +92,7 @@ def _right(plots: _Plots, spec: Spec) -> list[Any]:
             plots.lines("Losses", "/learner/loss/**", legend=True),
             plots.lines("Forecast", FORECAST, legend=True),
             plots.lines("Mean Q", "/learner/q_mean"),
-            plots.lines("Temperature", "/learner/alpha"),
+            *([] if spec.states else [plots.lines("Temperature", "/learner/alpha")]),  # tables have none
             plots.lines("Entropy", "/learner/entropy"),
             plots.lines("Updates per s", "/learner/updates_per_s"),
         ),

@@ -22,6 +22,7 @@ from recorder.rows import Floats, Ints
 TimelineName = Literal["run_time", "wall", "tick", "episode", "unit"]
 
 SCALARS = "Scalars:scalars"
+NAMES = "SeriesLines:names"
 STATE = "StateChange:state"
 TEXT = "TextLog:text"
 LEVEL = "TextLog:level"
@@ -66,6 +67,15 @@ def texts(
     """One text component of one entity (log lines, levels, states), in the order of the timeline."""
     times, rows = _cells(path, entity, component, timeline)
     return times, ["".join(row or ()) for row in rows]
+
+
+def series(path: str | Path, entity: str) -> list[str]:
+    """Names of an entity's series, as they were written last: of the columns of its scalars."""
+    found: list[str] = []
+    for chunk in _chunks(path, content=entity, is_static=True, components=NAMES):
+        for row in chunk.to_record_batch().column(NAMES).to_pylist():
+            found = list(row or ())
+    return found
 
 
 def spans(path: str | Path, entity: str = "/learner/phase") -> list[Span]:

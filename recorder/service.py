@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 from recorder.finish import FinishError, finish, set_aside
+from recorder.grid import GridScene
 from recorder.intake import Intake
 from recorder.scene import MujocoScene, PointScene, Scene
 from recorder.sinks import Recording, open_recording
@@ -154,10 +155,11 @@ class RecorderService:
     def _scene(self, spec: Spec) -> Scene | None:
         if spec.scene == "point":
             return PointScene()
-        if spec.scene != "mujoco":
+        if spec.scene not in ("mujoco", "grid"):
             return None
         try:
-            return MujocoScene.load(self._run_dir.world_path)
+            path = self._run_dir.world_path
+            return MujocoScene.load(path) if spec.scene == "mujoco" else GridScene.load(path)
         except (OSError, ValueError) as error:
             self._say("WARN", f"no 3-D view: {error}")
             return None

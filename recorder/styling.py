@@ -10,12 +10,13 @@ import numpy as np
 import rerun as rr
 
 from recorder.telemetry import FORECAST
-from recorder.ticks import MISSED
+from recorder.ticks import MISSED, PHYSICS, PHYSICS_SERIES
 from rtcore.messages import CAUSES
 
 BLUE, ORANGE, GREEN = 0x4E9BFFFF, 0xFFA23AFF, 0x3ECF8EFF
 RED, PURPLE, GREY, YELLOW = 0xFF5A5FFF, 0xB18CFFFF, 0x9AA4B2FF, 0xFFE066FF
 DOT_SIZE = 3.0
+JUDGED = ("last_error", "last_baseline_error", "trust")  # of the forecast's gauges
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
 
 Drawing = Literal["Average", "Max", "Steps", "Dots", "Line and dots"]
@@ -41,6 +42,7 @@ LOOKS: dict[str, Look] = {
     "/env/reward": Look(("reward",), (BLUE,), width=1.0),
     "/env/return": Look(("return",), (GREEN,), "Line and dots"),
     "/env/pacing_us": Look(("pacing error",), (GREY,), "Max"),
+    PHYSICS: Look(PHYSICS_SERIES, (ORANGE, GREEN, PURPLE), "Steps"),
     "/agent/loop_us": Look(("loop",), (ORANGE,), "Max"),
     "/agent/reaction_us": Look(("agent's reaction",), (BLUE,), "Max"),
     MISSED: Look(("missed",), (RED,), "Max"),
@@ -80,9 +82,9 @@ def looks(look: Look) -> list[rr.AsComponents]:
 
 
 def forecast_look(names: Sequence[str]) -> Look:
-    """The forecast's gauges, in the order in which they turned up; only the errors share a scale."""
+    """The forecast's gauges, in the order in which they turned up; only those of `JUDGED` are not hidden."""
     colours = tuple(PALETTE[i % len(PALETTE)] for i in range(len(names)))
-    return Look(tuple(names), colours, hidden=tuple(not name.endswith("error") for name in names))
+    return Look(tuple(names), colours, hidden=tuple(name not in JUDGED for name in names))
 
 
 def static_looks(*, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:

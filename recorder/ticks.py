@@ -10,6 +10,8 @@ from recorder.rows import Floats, Index, Rows, Scalars, Timeline
 from rtcore.config import EnvConfig
 from rtcore.messages import Spec, Step
 
+PHYSICS = "/env/physics"
+PHYSICS_SERIES = ("mass", "friction", "gravity")  # factors, in the order of `Step.physics`
 MISSED = "/agent/missed"  # and, below it, a series for each cause
 
 
@@ -43,6 +45,7 @@ class TickRows:
             Rows(MISSED, index, _series(_column(step.missed for step in steps))),
             _sparse("/agent/policy_version", index, np.where(versions >= 0, versions, np.nan)),
             _sparse("/env/return", index, returns),
+            *_physics(steps, index),
             *self._causes(steps, index),
         ]
         return [table for table in tables if len(table.index)]
@@ -90,10 +93,16 @@ class TickRows:
 
 def speed_per_m(spec: Spec, env: EnvConfig) -> float | None:
     """See `TickRows`; None for a world without a drifting target: where there is one, it is a speed."""
-    drifts = env.drift.kind != "none" and bool(env.drift.offset or env.drift.amplitude)
-    if not drifts or spec.scene == "" or spec.native_period_ns == 0:
+    if env.drift.still or spec.scene == "" or spec.native_period_ns == 0:
         return None
     return env.reward.k_f * 1e9 / spec.native_period_ns
+
+
+def _physics(steps: Sequence[Step], index: Index) -> list[Rows]:
+    """The factors of a world whose physics drift; the environment's configuration says for all steps."""
+    if not all(len(step.physics) == len(PHYSICS_SERIES) for step in steps):
+        return []
+    return [Rows(PHYSICS, index, Scalars(np.array([step.physics for step in steps], np.float64)))]
 
 
 def _first(step: Step) -> float:

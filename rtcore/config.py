@@ -37,18 +37,27 @@ class DriftConfig:
 
     kind: DriftKind = "sine"
     offset: float = 0.0  # where it moves around, or starts from
-    amplitude: float = 0.0  # how far it moves: sine, square, ramp, switch, burst
+    amplitude: float = 0.0  # how far it moves: sine, square, ramp, switch, burst; either way
     omega: float = 0.0  # sine, square: radians per unit
     phase: float = 0.0  # sine, square: radians
     at: float | Literal["random"] = 0.0  # ramp, switch, burst: the unit it begins in; or drawn from [0, span)
     span: float = 1.0  # ramp, burst: how many units it takes; switch: see `at`
-    every: float = 0.0  # switch, burst: again after so many units; 0: once
+    every: float = 0.0  # switch: back and forth after so many units; burst: again, > span; 0: once
     rate: float = 0.1  # ou: pull towards the offset, per unit
     sd: float = 0.0  # random_walk, ou, noise: standard deviation of a unit's step
-    low: float | None = None  # bounds of the value, of any kind
+    low: float | None = None  # bounds of the value, of any kind but none; a walk goes on beyond, unseen
     high: float | None = None
     seed: int | None = None  # of what is random; None: the run's seed
-    path: str = ""  # recorded: a CSV file with the columns "unit" and "value"
+    path: str = ""  # recorded: a CSV file with the columns "unit" and "value"; a value holds until the next
+
+    @property
+    def still(self) -> bool:
+        """Whether the value is 0 in every unit."""
+        if self.kind in ("none", "recorded"):
+            return self.kind == "none"
+        walks = self.kind in ("random_walk", "ou", "noise")
+        moves = 0.0 if self.kind == "constant" else self.sd if walks else self.amplitude
+        return not (self.offset or moves or (self.low or 0.0) > 0 or (self.high or 0.0) < 0)
 
 
 def _still() -> DriftConfig:
@@ -57,7 +66,10 @@ def _still() -> DriftConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
-    """Drift of the dynamics: each a factor on what the world was built with; kind "none" leaves it alone."""
+    """Drift of the dynamics: each a factor on what the world was built with; kind "none" leaves it alone.
+
+    So `offset` is usually 1. A mass never gets below 0.05 of its own, the others not below 0.
+    """
 
     mass: DriftConfig = field(default_factory=_still)
     friction: DriftConfig = field(default_factory=_still)
@@ -111,7 +123,8 @@ class EnvConfig:
     hold_ticks: int = 5  # for hold_then_neutral: held so many ticks, then neutral
     count: int = 1
     start_wait_s: float = 15.0  # T0 waits so long, at most, for an agent and a learner to be there
-    notify: Notify = "none"  # what the agent may know of the drift, appended to the observation
+    notify: Notify = "none"  # told of the drift, as a number after the world's observation: 1 in a unit
+    # in which target or physics changed, else 0; or the target's value
     drift: DriftConfig = field(default_factory=DriftConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -163,9 +176,7 @@ class RewardModelConfig:
 
     model: Literal["declared", "learned"] = "declared"  # the family of `env.reward`, or a network
     speed_entry: int = 0  # declared: which entry of the observation is the speed v
-    forecast: Literal["best", "persistence", "line", "level", "ar", "none"] = (
-        "best"  # none: relabelling alone
-    )
+    forecast: Literal["best", "persistence", "line", "level", "ar"] = "best"  # persistence: relabelling alone
     hidden: tuple[int, ...] = (32, 32)  # learned
     lr: float = 3e-3  # learned: of the network
     latent_lr: float = 2e-2  # learned: of the units' latents

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from rtcore.config import ConfigError, ForecastConfig, LearnerConfig, RunConfig
+from rtcore.config import ConfigError, DriftConfig, ForecastConfig, LearnerConfig, RunConfig
 from rtcore.windows import make_schedule
 
 MOST = 10**9  # of anything counted; as seconds (31 years) its nanoseconds still fit a 64-bit message field
@@ -229,16 +229,28 @@ def _check_together(config: RunConfig) -> None:
         if value > learner.replay_capacity:
             allowed = f"must be <= learner.replay_capacity, which is {learner.replay_capacity}"
             raise ConfigError(f"learner.{name}", value, allowed)
+    _check_drift("env.drift", env.drift)
+    for quantity in ("mass", "friction", "gravity"):
+        _check_drift(f"env.physics.{quantity}", getattr(env.physics, quantity))
     _check_algorithm(learner)
     _check_forecast(learner.forecast)
     make_schedule(learner.schedule)
+
+
+def _check_drift(name: str, drift: DriftConfig) -> None:
+    if drift.low is not None and drift.high is not None and drift.low > drift.high:
+        raise ConfigError(f"{name}.low", drift.low, f"must be <= {name}.high, which is {drift.high:g}")
+    if drift.kind == "burst" and 0 < drift.every <= drift.span:
+        allowed = f"must be above {name}.span, which is {drift.span:g}, or 0 for one burst"
+        raise ConfigError(f"{name}.every", drift.every, allowed)
 
 
 def _check_algorithm(learner: LearnerConfig) -> None:
     table = learner.table
     if learner.gamma == 1 and learner.algo not in ("q", "fq", "tempo"):
         raise ConfigError("learner.gamma", learner.gamma, f"must be below 1 for {learner.algo}")
-    if learner.algo == "npg" and table.eta * table.entropy > 1 - learner.gamma:
+    # the largest eta itself may land a rounding above it: 1 - 0.9 is 0.09999999999999998
+    if learner.algo == "npg" and table.eta * table.entropy > (1 - learner.gamma) * (1 + 1e-9):
         most = (1 - learner.gamma) / table.entropy
         allowed = f"must be <= (1 - learner.gamma) / learner.table.entropy, which is {most:g}"
         raise ConfigError("learner.table.eta", table.eta, allowed)

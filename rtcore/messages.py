@@ -49,7 +49,7 @@ class Spec(Message, frozen=True, kw_only=True):
     wall_t0_ns: Nanos  # Unix time at t0_ns, for the `wall` timeline alone
     tick_ns: Annotated[int, msgspec.Meta(gt=0)]
     unit_ns: Annotated[int, msgspec.Meta(gt=0)]
-    observation_dim: Annotated[int, msgspec.Meta(gt=0)]  # with observed actions included
+    observation_dim: Annotated[int, msgspec.Meta(gt=0)]  # with what `notify` tells and observed actions
     action_dim: Annotated[int, msgspec.Meta(gt=0)]
     action_low: list[float]
     action_high: list[float]
@@ -97,6 +97,7 @@ class Step(Message, frozen=True, kw_only=True):
     rehearsal: bool = False  # sent once more to keep the act path warm: on the real-time path only
     late_loop_ns: Index = -1  # of the newest answer heard at this tick that came too late; -1: there was none
     late_reaction_ns: Index = -1
+    physics: list[float] = []  # true factors on mass, friction, gravity, if any drifts; as `drift`, not read
 
 
 class StepBatch(Message, frozen=True, kw_only=True):

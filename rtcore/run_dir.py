@@ -117,7 +117,7 @@ class RunDir:
 
     @property
     def world_path(self) -> Path:
-        """`world.mjb`: the compiled MuJoCo model to draw, if the world has one."""
+        """`world.mjb`: the compiled MuJoCo model to draw, if the world has one; a board lies beside it."""
         return self.path / "world.mjb"
 
     def log_path(self, process: str) -> Path:

@@ -10,33 +10,41 @@ import difflib
 import logging
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from env_server.worlds.names import OWN_WORLDS
+from env_server.worlds.physics import Physics
 from env_server.worlds.world import Outcome, Position, Vector
 from rtcore.config import ConfigError
+
+if TYPE_CHECKING:
+    from env_server.worlds.mujoco_physics import ModelPhysics
 
 _LOG = logging.getLogger(__name__)
 
 
 class GymWorld:
-    """An environment under its own reward, without its time limit; nothing drifts.
+    """An environment under its own reward, without its time limit; only its physics may drift.
 
     Observations and actions are flattened to float32 vectors.
     """
 
     states = actions = 0
 
-    def __init__(self, env_id: str, *, seed: int, frame_skip: int | None = None) -> None:
+    def __init__(
+        self, env_id: str, *, seed: int, frame_skip: int | None = None, physics: Physics | None = None
+    ) -> None:
         """Builds the environment.
 
         Args:
             env_id: a registered Gymnasium id.
             seed: of the first episode that is reset without a seed.
             frame_skip: physics steps per step, MuJoCo environments only; None: as registered.
+            physics: what drifts of a MuJoCo environment; None: nothing.
 
         Raises:
             ConfigError: no such environment, or its spaces are not continuous.
@@ -54,6 +62,8 @@ class GymWorld:
         self._model = getattr(inner, "model", None) if hasattr(inner, "frame_skip") else None
         self._inner = inner
         self._seed: int | None = seed
+        self._physics = physics
+        self._tuned = None if physics is None or not physics.drifts else self._tune(physics)
 
     @property
     def observation_dim(self) -> int:
@@ -81,14 +91,27 @@ class GymWorld:
         """`mujoco` or nothing."""
         return "" if self._model is None else "mujoco"
 
-    def reset(self, seed: int | None, _t: int, /) -> Vector:
-        """Begin an episode; the unit means nothing to this world."""
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Which of mass, friction and gravity can drift."""
+        if self._model is None:
+            return ()
+        from env_server.worlds.mujoco_physics import tunable
+
+        return tunable(self._model)
+
+    def reset(self, seed: int | None, t: int, /) -> Vector:
+        """Begin an episode."""
+        if self._tuned is not None:
+            self._tuned.apply(t)
         seed, self._seed = (self._seed if seed is None else seed), None
         observation, _ = self._env.reset(seed=seed)
         return _flat(observation)
 
-    def step(self, action: Vector, _t: int, /) -> Outcome:
+    def step(self, action: Vector, t: int, /) -> Outcome:
         """One step of the environment."""
+        if self._tuned is not None:
+            self._tuned.apply(t)
         shaped = action.reshape(self._actions.shape).astype(self._actions.dtype)
         observation, reward, terminated, truncated, _ = self._env.step(shaped)
         return Outcome(
@@ -100,8 +123,12 @@ class GymWorld:
         )
 
     def drift(self, _t: int, /) -> float:
-        """Nothing drifts."""
+        """There is no target."""
         return 0.0
+
+    def physics(self, t: int, /) -> tuple[float, ...]:
+        """The factors of unit t."""
+        return () if self._physics is None else self._physics.told(t)
 
     def position(self) -> Position:
         """MuJoCo's qpos; empty for the others."""
@@ -121,6 +148,12 @@ class GymWorld:
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
+
+    def _tune(self, physics: Physics) -> ModelPhysics:
+        from env_server.worlds.mujoco_physics import ModelPhysics
+
+        assert self._model is not None, "the registry lets only the physics of MuJoCo worlds drift"
+        return ModelPhysics(self._model, physics)
 
 
 def _flat(observation: Any) -> Vector:
@@ -148,22 +181,22 @@ def _make(env_id: str, frame_skip: int | None) -> gymnasium.Env[Any, Any]:
 
 
 def _known(env_id: str) -> str:
-    near = difflib.get_close_matches(env_id, ["pointmass", *gymnasium.registry], n=3)
+    near = difflib.get_close_matches(env_id, [*OWN_WORLDS, *gymnasium.registry], n=3)
     hint = f"; did you mean {', '.join(near)}?" if near else ""
-    return f'"pointmass" or a registered Gymnasium id{hint}'
+    return f"{', '.join(OWN_WORLDS)} or a registered Gymnasium id{hint}"
 
 
 def _box(env_id: str, space: gymnasium.Space[Any], what: str) -> Box:
     if not isinstance(space, Box):
         found = type(space).__name__
-        raise ConfigError("env.id", env_id, f"needs a continuous (Box) {what} space for sac, not {found}")
+        raise ConfigError("env.id", env_id, f"needs a continuous (Box) {what} space, not {found}")
     return space
 
 
 def _bounds(env_id: str, actions: Box) -> tuple[Vector, Vector]:
     low, high = _flat(actions.low), _flat(actions.high)
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
-        raise ConfigError("env.id", env_id, "needs a bounded action space, low below high, for sac")
+        raise ConfigError("env.id", env_id, "needs a bounded action space, low below high")
     return low, high
 
 

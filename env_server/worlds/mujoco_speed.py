@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from env_server.worlds.drift import value
+from env_server.worlds.drift import make_drift
 from env_server.worlds.gym_world import GymWorld
 from env_server.worlds.period import Timing
+from env_server.worlds.physics import Physics
 from env_server.worlds.reward import speed_reward
 from env_server.worlds.world import Outcome, Position, Vector
 from rtcore.config import DriftConfig, RewardConfig
@@ -33,10 +34,11 @@ class SpeedWorld:
         timing: Timing,
         steps: int,
         seed: int,
+        physics: Physics | None = None,
     ) -> None:
         """`steps` physics steps pass per tick; `timing` is the world's own, from the registry."""
-        self._world = GymWorld(env_id, seed=seed, frame_skip=steps)
-        self._drift = drift
+        self._world = GymWorld(env_id, seed=seed, frame_skip=steps, physics=physics)
+        self._drift = make_drift(drift, seed)
         self._reward = reward
         self.native_period_s, self.physics_step_s = timing.native_s, timing.physics_s
         assert timing.physics_s is not None
@@ -55,13 +57,17 @@ class SpeedWorld:
         before_m = self._forward_m()
         plain = self._world.step(action, t)
         speed = (self._forward_m() - before_m) / self._period_s
-        target = value(self._drift, t)
+        target = self._drift.value(t)
         reward = speed_reward(self._reward, speed=speed, target=target, action=action)
         return Outcome(plain.observation, reward, plain.terminated, plain.truncated, drift=target)
 
     def drift(self, t: int, /) -> float:
         """The target speed v_d(t) in m/s."""
-        return value(self._drift, t)
+        return self._drift.value(t)
+
+    def physics(self, t: int, /) -> tuple[float, ...]:
+        """The factors of unit t."""
+        return self._world.physics(t)
 
     def position(self) -> Position:
         """The walker's qpos."""

@@ -77,7 +77,7 @@ class World(Protocol):
 
     @property
     def scene(self) -> str:
-        """How to draw it: "mujoco" (`save_scene` writes the model), "point", "grid", or "" for not at all."""
+        """How to draw it: "mujoco", "point", "grid" (see `save_scene`), or "" for not at all."""
 
     def reset(self, seed: int | None, t: int, /) -> Vector:
         """Begin an episode in unit `t`.
@@ -94,11 +94,15 @@ class World(Protocol):
     def drift(self, t: int, /) -> float:
         """The drift's true value in unit `t`; 0 where nothing drifts."""
 
+    def physics(self, t: int, /) -> tuple[float, ...]:
+        """The factors on mass, friction and gravity in unit `t`; empty where none of them drifts."""
+
     def position(self) -> Position:
         """float64 coordinates for drawing (MuJoCo: qpos), a copy; empty where there is no scene."""
 
     def save_scene(self, path: Path, /) -> None:
-        """Write what a viewer needs to draw `position`; only worlds with scene "mujoco" write a file."""
+        """Write what a viewer needs to draw `position`: with scene "mujoco" a model at `path`, with "grid" a
+        board beside it (`rtcore.board`), else no file."""
 
     def close(self) -> None:
         """Free the simulator. A second close does nothing."""

@@ -59,6 +59,9 @@ class ScriptedWorld:
     def drift(self, t: int, /) -> float:
         return 10.0 * t
 
+    def physics(self, _t: int, /) -> tuple[float, ...]:
+        return ()
+
     def position(self) -> Position:
         return np.array([float(self._ticks)])
 

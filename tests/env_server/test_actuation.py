@@ -23,6 +23,7 @@ def make(
     observe: int = 0,
     low: Sequence[float] = (-1.0, -2.0),
     high: Sequence[float] = (1.0, 2.0),
+    actions: int = 0,
 ) -> Actuation:
     return Actuation(
         Rules(
@@ -32,6 +33,7 @@ def make(
             observe_actions=observe,
             low=np.array(low, np.float32),
             high=np.array(high, np.float32),
+            actions=actions,
             incarnation=INCARNATION,
         )
     )
@@ -140,6 +142,34 @@ def test_out_of_bounds_is_clipped_and_told() -> None:
     assert (decision.verdict, decision.clipped, decision.missed) == ("answer", True, False)
     rounding = decide(make(), action(9, (1.0 + 2e-7, 0.0)))
     assert (rounding.applied.tolist(), rounding.clipped) == ([1.0, 0.0], False)
+
+
+def finite(*, on_miss: MissPolicy = "hold", delay: int = 0) -> Actuation:
+    """Four actions, 0 to 3."""
+    return make(on_miss=on_miss, delay=delay, low=(0.0,), high=(3.0,), actions=4)
+
+
+@pytest.mark.parametrize("number", [0.0, 1.0, 3.0])
+def test_a_finite_world_takes_the_number_of_an_action(number: float) -> None:
+    decision = decide(finite(), action(9, (number,)))
+    assert (decision.applied.tolist(), decision.verdict) == ([number], "answer")
+    assert (decision.missed, decision.clipped) == (False, False)
+
+
+@pytest.mark.parametrize("number", [-1.0, 4.0, 1.5, 2.999, -0.25, 1e30, math.nan, math.inf, -math.inf])
+def test_what_is_no_number_of_an_action_is_no_answer(number: float) -> None:
+    actuation = finite()
+    decide(actuation, action(8, (2.0,)), 8)
+    decision = decide(actuation, action(9, (number,)))
+    assert (decision.verdict, decision.missed, decision.fallback) == ("invalid", True, "hold")
+    assert (decision.applied.tolist(), decision.clipped) == ([2.0], False)
+
+
+def test_neutral_is_action_0_in_a_finite_world() -> None:
+    actuation = finite(on_miss="neutral", delay=1)
+    assert decide(actuation, action(1, (3.0,)), 1).applied.tolist() == [0.0]  # what the delay line began with
+    assert decide(actuation, None, 2).applied.tolist() == [3.0]
+    assert decide(actuation, action(3, (1.0,)), 3).applied.tolist() == [0.0]
 
 
 @pytest.mark.parametrize(

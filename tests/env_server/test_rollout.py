@@ -4,17 +4,26 @@ import numpy as np
 import pytest
 
 from env_server.actuation import Actuation, Rules
-from env_server.rollout import Rollout, Turn
+from env_server.rollout import Rollout, Turn, told
+from env_server.worlds.registry import make_world
+from rtcore.config import DriftConfig, EnvConfig, Notify, PhysicsConfig
 from rtcore.messages import Action
 from tests.env_server.scripted import ScriptedWorld
 
 
-def make(world: ScriptedWorld, *, episode_steps: int = 4, seed: int = 7, observe: int = 0) -> Rollout:
+def make(
+    world: ScriptedWorld,
+    *,
+    episode_steps: int = 4,
+    seed: int = 7,
+    observe: int = 0,
+    notify: Notify = "none",
+) -> Rollout:
     rules = Rules(
         on_miss="hold", hold_ticks=1, action_delay_ticks=0, observe_actions=observe, low=world.action_low,
         high=world.action_high, incarnation=1,
     )  # fmt: skip
-    return Rollout(world, Actuation(rules), episode_steps=episode_steps, seed=seed)
+    return Rollout(world, Actuation(rules), episode_steps=episode_steps, seed=seed, notify=notify)
 
 
 def turns(rollout: Rollout, number: int, t: int = 2) -> list[Turn]:
@@ -77,3 +86,26 @@ def test_a_broken_world_reaches_nobody_and_begins_again() -> None:
     assert broken.observation.tolist() == played[2].observation.tolist()
     assert (broken.reward, broken.terminated, broken.truncated) == (0.0, False, True)
     assert [turn.episode_tick for turn in played] == [0, 1, 2, 3, 0, 1]
+
+
+@pytest.mark.parametrize(("notify", "number"), [("changed", 1.0), ("value", 20.0)])
+def test_what_is_told_stands_between_the_world_and_the_decisions(notify: Notify, number: float) -> None:
+    played = turns(make(ScriptedWorld(), observe=1, notify=notify), 4)  # all in unit 2, where the drift is 20
+    assert played[0].observation.tolist() == [0, 0, number, 0]  # at a reset too
+    assert played[3].observation.tolist() == pytest.approx([3, 0.003, number, 0.003])
+    assert played[3].observation.dtype == np.float32
+
+
+def test_a_broken_world_still_tells() -> None:
+    played = turns(make(ScriptedWorld(breaks_at=1), notify="value"), 2)
+    assert played[1].broken and played[1].observation.tolist() == [0, 0, 20]
+
+
+def test_changed_is_one_in_units_that_differ_from_the_one_before() -> None:
+    switch = DriftConfig(kind="switch", amplitude=1.0, at=0, every=3)  # 1 1 1 0 0 0 1
+    heavy = DriftConfig(kind="switch", offset=1.0, amplitude=1.0, at=4)  # 1 1 1 1 2 2 2
+    env = EnvConfig(id="pointmass", drift=switch)
+    assert [told(make_world(env, 0), "changed", t) for t in range(7)] == [0, 0, 0, 1, 0, 0, 1]
+    env = EnvConfig(id="pointmass", drift=switch, physics=PhysicsConfig(mass=heavy))
+    assert [told(make_world(env, 0), "changed", t) for t in range(7)] == [0, 0, 0, 1, 1, 0, 1]
+    assert [told(make_world(env, 0), "value", t) for t in range(7)] == [1, 1, 1, 0, 0, 0, 1]

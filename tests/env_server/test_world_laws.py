@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
-from env_server.worlds.drift import value
+from env_server.wording import word_spec
+from env_server.worlds.drift import make_drift
 from env_server.worlds.pointmass import PointMass
 from env_server.worlds.registry import make_world
 from env_server.worlds.world import Outcome, Vector, World
-from rtcore.config import DriftConfig, EnvConfig, RewardConfig
+from rtcore.config import DriftConfig, EnvConfig, MdpConfig, Notify, PhysicsConfig, RewardConfig
+from rtcore.messages import Step
+from tests.env_server.rig import Rig, run_config
+from tests.env_server.scripted import ScriptedAgent
 
 SINE = DriftConfig(kind="sine", offset=0.5, amplitude=1.0, omega=0.3)
+WEIGHT = DriftConfig(kind="sine", offset=0.5, amplitude=0.5, omega=0.3)
+PHYSICS = PhysicsConfig(
+    mass=DriftConfig(kind="sine", offset=1.0, amplitude=0.4, omega=0.3),
+    friction=DriftConfig(kind="switch", offset=1.0, amplitude=-0.5, at=3, every=4),
+    gravity=DriftConfig(kind="ou", offset=1.0, sd=0.1),
+)
 NONE = DriftConfig(kind="none")
 WORLDS = {
     "halfcheetah": EnvConfig(drift=SINE),
@@ -26,8 +37,20 @@ WORLDS = {
     "pointmass_twice": EnvConfig(id="pointmass", drift=SINE, hz=10.0, speed=1.0),
     "pendulum": EnvConfig(id="Pendulum-v1", drift=NONE),
     "hopper": EnvConfig(id="Hopper-v5", drift=NONE),  # one that terminates
+    "halfcheetah_walk": EnvConfig(drift=DriftConfig(kind="random_walk", sd=0.3)),
+    "halfcheetah_physics": EnvConfig(drift=SINE, physics=PHYSICS),
+    "hopper_physics": EnvConfig(id="Hopper-v5", drift=NONE, physics=PHYSICS),
+    "pointmass_physics": EnvConfig(
+        id="pointmass", drift=SINE, physics=PhysicsConfig(mass=PHYSICS.mass, friction=PHYSICS.friction)
+    ),
+    "cliffworld": EnvConfig(id="cliffworld", hz=10.0, drift=DriftConfig(kind="switch", amplitude=1.0, at=6)),
+    "bandit": EnvConfig(id="bandit", hz=10.0, drift=WEIGHT),
+    "random_mdp": EnvConfig(id="random_mdp", hz=10.0, drift=WEIGHT, mdp=MdpConfig(drifting="both")),
+    "chain": EnvConfig(id="chain", hz=10.0, drift=WEIGHT, mdp=MdpConfig(slip=0.2)),
 }
 STEPS = 30
+# Something of them is drawn from the run's seed, once: the others are the same in every run.
+DRAWN = [WORLDS[name] for name in ("halfcheetah_walk", "halfcheetah_physics", "hopper_physics", "random_mdp")]
 
 
 @pytest.fixture(params=list(WORLDS))
@@ -44,6 +67,8 @@ def world(env: EnvConfig) -> Iterator[World]:
 
 def _actions(world: World, seed: int = 1) -> list[Vector]:
     rng = np.random.default_rng(seed)
+    if world.actions:
+        return [rng.integers(world.actions, size=1).astype(np.float32) for _ in range(STEPS)]
     return [rng.uniform(world.action_low, world.action_high).astype(np.float32) for _ in range(STEPS)]
 
 
@@ -76,20 +101,33 @@ def test_spaces(world: World) -> None:
     assert (world.position().size > 0) == (world.scene != "")
 
 
+def test_numbered_spaces(world: World) -> None:
+    assert (world.states > 0) == (world.actions > 0)
+    if not world.states:
+        return
+    assert world.observation_dim == world.action_dim == 1
+    assert (world.action_low.tolist(), world.action_high.tolist()) == ([0.0], [world.actions - 1.0])
+    seen = [world.reset(0, 0)] + [world.step(action, 0).observation for action in _actions(world)]
+    assert {float(observation[0]) for observation in seen} <= set(map(float, range(world.states)))
+
+
 def test_deterministic_by_seed(env: EnvConfig, world: World) -> None:
     first = _trace(world, 7)
     assert _trace(world, 7) == first
-    assert _trace(world, 8) != first
-    other = make_world(env, 99)
-    assert _trace(other, 7) == first
-    other.close()
+    if env.id != "cliffworld":  # nothing in it is random
+        assert _trace(world, 8) != first
+    for seed in (5, 99):  # the run's
+        other = make_world(env, seed)
+        assert (_trace(other, 7) == first) == (seed == 5 or env not in DRAWN)
+        other.close()
 
 
 def test_without_a_seed_the_world_goes_on_with_its_own(env: EnvConfig, world: World) -> None:
     twin = make_world(env, 5)
     episodes = [_trace(world, None) for _ in range(2)]
     assert [_trace(twin, None) for _ in range(2)] == episodes
-    assert episodes[0] != episodes[1]
+    if env.id != "cliffworld":
+        assert episodes[0] != episodes[1]
     twin.close()
 
 
@@ -111,7 +149,7 @@ def test_positions_are_copies(world: World) -> None:
     for action in _actions(world)[:5]:
         world.step(action, 0)
     np.testing.assert_array_equal(before, kept)
-    if world.scene:
+    if world.scene and world.scene != "grid":  # there a move against the edge leads nowhere
         assert (world.position() != before).any()
 
 
@@ -124,11 +162,72 @@ def test_terminated_and_truncated_never_meet_and_no_time_limit_is_left(world: Wo
             world.reset(None, 0)
 
 
-def test_drift_follows_the_unit_alone(env: EnvConfig, world: World) -> None:
-    world.reset(3, 4)
-    expected = [value(env.drift, t) for t in (0, 9, 9, 2)]
-    assert [world.step(_actions(world)[0], t).drift for t in (0, 9, 9, 2)] == expected
-    assert [world.drift(t) for t in (0, 9, 9, 2)] == expected
+def test_drift_is_a_function_of_the_unit_alone(env: EnvConfig, world: World) -> None:
+    """Whatever was done, in whichever order it is asked for, before and after resets, in another world."""
+    drift = make_drift(env.drift, 5)
+    other = make_world(env, 5)
+    expected = {t: drift.value(t) for t in (300, 0, 9, 2)}
+    physics = {t: other.physics(t) for t in (2, 300, 0, 9)}
+    other.close()
+    for number, t in enumerate((9, 0, 300, 2, 9, 0)):
+        if number % 3 == 0:
+            world.reset(None, t)
+        assert (world.drift(t), world.physics(t)) == (expected[t], physics[t])
+        assert world.step(_actions(world)[number], t).drift == expected[t]
+        assert (world.drift(t), world.physics(t)) == (expected[t], physics[t])
+    assert len(set(expected.values())) > 1 or env.drift.kind == "none"
+    assert len(set(physics.values())) > 1 or env.physics == PhysicsConfig()
+    if env.physics == PhysicsConfig():
+        assert set(physics.values()) == {()}
+
+
+UNIT_TICKS = 5
+
+
+def _units_of(env: EnvConfig, world: World, *, stall: int | None = None) -> tuple[list[Step], int]:
+    """The steps of 60 ticks, 5 to a unit, with no agent answering; at tick `stall` the env server sleeps for
+    12 ticks and a half. Also the number of skipped ticks."""
+    hz = env.hz or 20.0
+    run = run_config(duration_s=60 / hz, seed=5, id=env.id, hz=hz, speed=env.speed, unit_s=UNIT_TICKS / hz)
+    run = replace(run, env=replace(env, hz=hz, speed=run.env.speed, unit_s=run.env.unit_s, episode_steps=7))
+    rig = Rig(run, world)
+
+    def nobody(_agent: ScriptedAgent, step: Step) -> None:
+        if step.tick == stall:
+            rig.clock.sleep_until_ns(rig.clock.now_ns() + round(12.5e9 / hz))
+
+    steps = rig.run(nobody)
+    assert rig.ledger.counter("missed") == sum(step.episode_tick > 0 for step in steps)
+    return steps, rig.service.pacer.skipped_total
+
+
+@pytest.mark.parametrize("stall", [None, 13])
+def test_drift_goes_on_by_the_clock_while_nobody_acts(
+    env: EnvConfig, world: World, stall: int | None
+) -> None:
+    steps, skipped = _units_of(env, world, stall=stall)
+    drift, twin = make_drift(env.drift, 5), make_world(env, 5)
+    assert skipped == (0 if stall is None else 11)  # the 12th deadline was the latest one that had passed
+    assert len(steps) == 60 - skipped
+    assert [step.unit for step in steps] == [step.tick // UNIT_TICKS for step in steps]
+    assert [step.drift for step in steps] == [drift.value(step.unit) for step in steps]
+    assert [tuple(step.physics) for step in steps] == [twin.physics(step.unit) for step in steps]
+    twin.close()
+
+
+@pytest.mark.parametrize(("notify", "dim"), [("none", 3), ("changed", 4), ("value", 4)])
+def test_the_spec_declares_what_the_steps_carry(notify: Notify, dim: int) -> None:
+    run = run_config(duration_s=0.5, notify=notify, observe_actions=2)
+    run = replace(run, env=replace(run.env, drift=SINE))
+    world = make_world(run.env, 0)
+    steps = Rig(run, world).run()
+    spec = word_spec(run.env, world, incarnation=1, t0_ns=0, wall_t0_ns=0, tick_ns=1)
+    assert {len(step.observation) // 4 for step in steps} == {spec.observation_dim} == {dim}
+    told = [float(np.frombuffer(step.observation, "<f4")[1]) for step in steps]  # after the speed
+    if notify == "value":
+        assert told == [float(np.float32(step.drift)) for step in steps]
+    if notify == "changed":
+        assert told == [float(step.unit > 0) for step in steps]
 
 
 def test_drift_moves_the_reward_and_nothing_else() -> None:
@@ -146,7 +245,7 @@ def test_drift_moves_the_reward_and_nothing_else() -> None:
 def test_scene_file(world: World, tmp_path: Path) -> None:
     path = tmp_path / "world.mjb"
     world.save_scene(path)
-    assert path.exists() == (world.scene == "mujoco")
+    assert path.exists() == (world.scene == "mujoco")  # a board stands beside it, in a file of its own
     assert len(list(tmp_path.iterdir())) <= 1
     if path.exists():
         import mujoco
@@ -240,4 +339,4 @@ def test_pointmass_with_two_periods_per_tick_is_the_one_period_world_twice() -> 
     outcome = two.step(action, 6)
     assert outcome.observation[0] == speeds[1]
     assert two.position() == pytest.approx(one.position())
-    assert outcome.reward == pytest.approx(-abs((speeds[0] + speeds[1]) / 2 - value(SINE, 6)))
+    assert outcome.reward == pytest.approx(-abs((speeds[0] + speeds[1]) / 2 - make_drift(SINE, 0).value(6)))

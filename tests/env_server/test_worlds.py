@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium
 import numpy as np
@@ -13,17 +13,20 @@ import pytest
 from gymnasium.spaces import Box
 
 from env_server.worlds.gym_world import GymWorld
+from env_server.worlds.names import OWN_WORLDS
 from env_server.worlds.period import Timing
-from env_server.worlds.registry import SPEED_WORLDS, make_world, resolve
-from rtcore.config import ConfigError, DriftConfig, EnvConfig
+from env_server.worlds.registry import SPEED_WORLDS, TUNABLE, make_world, require_fit, resolve
+from rtcore.config import Algo, ConfigError, DriftConfig, EnvConfig, MdpConfig, PhysicsConfig
 
 NONE = DriftConfig(kind="none")
+TWICE = DriftConfig(kind="constant", offset=2.0)
 
 
 @pytest.mark.parametrize(("env_id", "timing"), SPEED_WORLDS.items())
 def test_the_table_of_speed_worlds_agrees_with_the_simulator(env_id: str, timing: Timing) -> None:
     world = GymWorld(env_id, seed=0)
     assert Timing(world.native_period_s, world.physics_step_s) == timing
+    assert world.tunable == TUNABLE[env_id]
     world.close()
 
 
@@ -36,6 +39,7 @@ def test_the_table_of_speed_worlds_agrees_with_the_simulator(env_id: str, timing
         (EnvConfig(id="Pendulum-v1"), 20.0, 1.0),
         (EnvConfig(id="HalfCheetah-v5", drift=NONE, hz=100.0, speed=2.0), 100.0, 2.0),
         (EnvConfig(id="MountainCarContinuous-v0", hz=30.0), 30.0, None),
+        (EnvConfig(id="cliffworld", hz=30.0), 30.0, None),
     ],
 )
 def test_resolve_fills_in(env: EnvConfig, hz: float, speed: float | None) -> None:
@@ -47,14 +51,17 @@ def test_resolve_fills_in(env: EnvConfig, hz: float, speed: float | None) -> Non
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (EnvConfig(id="HalfCheeta-v5"), r'^env.id = .*"pointmass" or a registered .* mean HalfCheetah-v5'),
+        (
+            EnvConfig(id="HalfCheeta-v5"),
+            r"^env.id = .*: pointmass, cliffworld, .* or a registered .* mean HalfCheetah-v5",
+        ),
         (EnvConfig(id="HalfCheetah-v99"), r"^env.id = 'HalfCheetah-v99': .*did you mean"),
         (EnvConfig(id="pointmas"), r"^env.id = 'pointmas': .*did you mean pointmass"),
         (EnvConfig(id="not an id"), r"^env.id = 'not an id': cannot be built here"),
         (EnvConfig(id="no_such_module:X-v0"), r"^env.id = 'no_such_module:X-v0'"),
         (EnvConfig(id="HalfCheetah-v2"), r"^env.id = 'HalfCheetah-v2': cannot be built here"),
-        (EnvConfig(id="CartPole-v1"), r"needs a continuous \(Box\) action space for sac, not Discrete"),
-        (EnvConfig(id="FrozenLake-v1"), r"needs a continuous \(Box\) observation space for sac"),
+        (EnvConfig(id="CartPole-v1"), r"needs a continuous \(Box\) action space, not Discrete"),
+        (EnvConfig(id="FrozenLake-v1"), r"needs a continuous \(Box\) observation space, not Discrete"),
         (EnvConfig(hz=200.0, speed=3.0), r"^env.speed = 3.0: .* physics step of 0.01 s"),
         (EnvConfig(id="pointmass", hz=100.0, speed=2.0), r"^env.speed = 2.0: .* physics step of 0.05 s"),
         (EnvConfig(id="Pendulum-v1", hz=50.0, speed=1.0), r"^env.speed = 1.0: .*the fixed step of 0.05 s"),
@@ -69,7 +76,55 @@ def test_resolve_fills_in(env: EnvConfig, hz: float, speed: float | None) -> Non
             EnvConfig(id="Pendulum-v1", drift=DriftConfig(kind="constant", offset=1.0)),
             r"^env.drift.kind = 'constant': ",
         ),
+        (EnvConfig(id="Pendulum-v1", drift=DriftConfig(kind="ou", sd=0.1)), r"^env.drift.kind = 'ou': "),
         (EnvConfig(id="Pendulum-v1", observe_actions=8000), r"^env.id = 'Pendulum-v1': an observation of 3"),
+        (EnvConfig(id="cliffworld"), r"^env.hz = None: needed"),
+        (EnvConfig(id="bandit", hz=9.0, speed=2.0), r"^env.speed = 2.0: bandit has no native period"),
+        (EnvConfig(id="clifworld"), r"^env.id = 'clifworld': .*did you mean cliffworld"),
+        (EnvConfig(id="chain", hz=9.0, notify="changed"), r"^env.notify = 'changed': \"none\" for chain"),
+        (EnvConfig(id="chain", hz=9.0, observe_actions=1), r"^env.observe_actions = 1: 0 for chain"),
+        (EnvConfig(id="pointmass", notify="value"), r"^env.notify = 'value': .*no value to tell"),
+        (EnvConfig(id="Pendulum-v1", notify="value"), r"^env.notify = 'value': .*no value to tell"),
+        (
+            EnvConfig(id="random_mdp", hz=9.0, mdp=MdpConfig(states=10_000)),
+            r"^env.mdp.states = 10000: with 3 actions",
+        ),
+        (
+            EnvConfig(id="pointmass", drift=DriftConfig(kind="recorded", path="/no.csv")),
+            r"^env.drift.path = '/no.csv': must be a readable file",
+        ),
+        (
+            EnvConfig(id="pointmass", physics=PhysicsConfig(gravity=TWICE)),
+            r"^env.physics.gravity.kind = 'constant': \"none\" for pointmass: only mass and friction can",
+        ),
+        (
+            EnvConfig(id="Pendulum-v1", physics=PhysicsConfig(mass=TWICE)),
+            r"^env.physics.mass.kind = 'constant': \"none\" for Pendulum-v1: its physics cannot drift",
+        ),
+        (
+            EnvConfig(id="chain", hz=9.0, physics=PhysicsConfig(mass=TWICE)),
+            r"^env.physics.mass.kind = 'constant': \"none\" for chain: its physics cannot drift",
+        ),
+        (
+            EnvConfig(id="Swimmer-v5", drift=TWICE, physics=PhysicsConfig(friction=TWICE)),
+            r"^env.physics.friction.kind = 'constant': \"none\" for Swimmer-v5: only mass can drift",
+        ),
+        (
+            EnvConfig(id="Reacher-v5", physics=PhysicsConfig(gravity=TWICE)),
+            r"^env.physics.gravity.kind = 'constant': \"none\" for Reacher-v5",
+        ),
+        (
+            EnvConfig(physics=PhysicsConfig(mass=DriftConfig(kind="sine", offset=1.0, amplitude=1.0))),
+            r"^env.physics.mass.kind = 'sine': a factor on mass must stay at 0.05 or above, .* down to 0$",
+        ),
+        (
+            EnvConfig(physics=PhysicsConfig(mass=DriftConfig(kind="ou", sd=0.1))),  # offset 0, not 1
+            r"^env.physics.mass.kind = 'ou': .* goes down to 0$",
+        ),
+        (
+            EnvConfig(physics=PhysicsConfig(friction=DriftConfig(kind="constant", offset=-0.1))),
+            r"^env.physics.friction.kind = 'constant': .* at 0 or above, but this one goes down to -0.1$",
+        ),
     ],
 )
 def test_wrong_requests_are_one_line(env: EnvConfig, message: str) -> None:
@@ -77,6 +132,23 @@ def test_wrong_requests_are_one_line(env: EnvConfig, message: str) -> None:
         with pytest.raises(ConfigError, match=message) as caught:
             ask(env)
         assert "\n" not in str(caught.value)
+
+
+def test_algorithms_fit_worlds_or_are_told_which_do() -> None:
+    finite, all_algos = {"q", "fq", "npg"}, get_args(Algo)
+    fits = dict.fromkeys(OWN_WORLDS, finite) | {"bandit": finite | {"tempo"}}
+    fits |= {name: {"sac", "fsac", "rsac"} for name in ("pointmass", "HalfCheetah-v5", "Pendulum-v1")}
+    for name, fitting in fits.items():
+        for algo in all_algos:
+            if algo in fitting:
+                require_fit(EnvConfig(id=name), algo)
+                continue
+            with pytest.raises(ConfigError) as caught:
+                require_fit(EnvConfig(id=name), algo)
+            line = str(caught.value)
+            assert line.startswith(f"learner.algo = {algo!r}: one of ") and repr(name) in line
+            listed = line.split(": one of ")[1].split(" for ", maxsplit=1)[0]
+            assert set(listed.split(", ")) == fitting
 
 
 class _Odd(gymnasium.Env[Any, Any]):
@@ -142,7 +214,12 @@ def test_shapes_are_flattened_and_memory_is_copied() -> None:
 
 
 @pytest.mark.parametrize(
-    "what", ["resolve(EnvConfig())", 'make_world(resolve(EnvConfig(id="pointmass")), 0)']
+    "what",
+    [
+        "resolve(EnvConfig())",
+        'make_world(resolve(EnvConfig(id="pointmass")), 0)',
+        'make_world(resolve(EnvConfig(id="cliffworld", hz=9.0)), 0)',
+    ],
 )
 def test_no_simulator_is_loaded_where_none_is_needed(what: str) -> None:
     code = (

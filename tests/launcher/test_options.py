@@ -34,7 +34,10 @@ def test_presets_are_whole_and_named(name: str) -> None:
 
 
 def test_the_presets_that_users_are_promised() -> None:
-    assert presets.names() == ["halfcheetah", "gym", "halfcheetah_authors", "pointmass", "swimmer"]
+    assert presets.names() == [
+        "halfcheetah", "bandit", "bandit_conservative", "bandit_pessimistic", "chain", "cliffworld",
+        "cliffworld_as_published", "gym", "halfcheetah_authors", "pointmass", "random_mdp", "swimmer",
+    ]  # fmt: skip
 
 
 def test_the_default_is_halfcheetah_at_200_hz() -> None:
@@ -130,4 +133,4 @@ def test_a_unit_shorter_than_the_derived_tick_is_refused() -> None:
 
 
 def test_the_description_names_the_presets() -> None:
-    assert options.describe("X.").startswith("X. PRESET is one of halfcheetah, gym")
+    assert options.describe("X.").startswith("X. PRESET is one of halfcheetah, bandit")

@@ -135,6 +135,8 @@ def test_the_speed_reached_is_distance_over_simulated_time_and_has_gaps_where_it
         (DriftConfig(kind="sine", amplitude=0.5), "mujoco", 50 * MS, 60.0),  # k_f / 0.05 s
         (DriftConfig(kind="none", offset=1.0), "mujoco", 50 * MS, None),
         (DriftConfig(kind="sine"), "mujoco", 50 * MS, None),  # no target
+        (DriftConfig(kind="ou", sd=0.1), "mujoco", 50 * MS, 60.0),
+        (DriftConfig(kind="recorded", path="speeds.csv"), "mujoco", 50 * MS, 60.0),
         (DriftConfig(kind="constant", offset=1.0), "", 50 * MS, None),
         (DriftConfig(kind="constant", offset=1.0), "point", 0, None),
     ],
@@ -225,3 +227,12 @@ def test_a_policy_told_twice_is_one_publication() -> None:
     (table,) = telemetry.rows(Timeline(SPEC))
     assert table.index.run_time_ns.tolist() == [UNIT + 3, 2 * UNIT + 3]
     assert scalars([table], "/learner/published_version")[1] == [[1.0], [2.0]]
+
+
+def test_physics_that_drift_have_a_series_each_and_others_none() -> None:
+    steps = [make_step(seq, physics=[1.0 + seq, 0.5, 1.0]) for seq in range(2)]
+    assert scalars(TickRows(Timeline(SPEC)).rows(steps), "/env/physics") == (
+        [0, 1],
+        [[1.0, 0.5, 1.0], [2.0, 0.5, 1.0]],
+    )
+    assert "/env/physics" not in {rows.entity for rows in TickRows(Timeline(SPEC)).rows([make_step(0)])}

@@ -223,13 +223,34 @@ def test_lists_count_for_the_explicit_schedule_alone() -> None:
     check(replaced(paper, "learner.schedule.kind", "explicit"))
 
 
+def test_the_largest_policy_step_is_allowed_as_it_is_named() -> None:
+    npg = replaced(RunConfig(), "learner.algo", "npg")
+    npg = replaced(replaced(npg, "learner.gamma", 0.9), "learner.table.entropy", 1.0)
+    check(replaced(npg, "learner.table.eta", 0.1))
+    with pytest.raises(ConfigError, match=r"learner.table.eta = 0.101: must be <= .*, which is 0.1$"):
+        check(replaced(npg, "learner.table.eta", 0.101))
+
+
 def test_a_section_is_a_section() -> None:
     assert failure(("env", {"hz": 50})).startswith("env = {'hz': 50}: must be of type EnvConfig")
 
 
 @given(low=st.floats(), value=st.floats())
 def test_intervals_are_what_they_say(low: float, value: float) -> None:
-    assert RULES["learner.gamma"].holds(value) == (0 <= value < 1)
+    assert RULES["learner.gamma"].holds(value) == (0 <= value <= 1)
     assert RULES["learner.tau"].holds(value) == (0 < value <= 1)
     assert RULES["learner.utd"].holds(low) == (0 < low < INF)
     assert RULES["env.drift.phase"].holds(low) == (-INF < low < INF)
+
+
+@pytest.mark.parametrize("name", ["env.drift", "env.physics.gravity"])
+def test_a_drift_is_consistent(name: str) -> None:
+    message = f"{name}.low = 2.0: must be <= {name}.high, which is 1"
+    assert failure((f"{name}.low", 2.0), (f"{name}.high", 1.0)) == message
+    burst: list[tuple[str, object]] = [(f"{name}.kind", "burst"), (f"{name}.span", 3.0)]
+    message = f"{name}.every = 3.0: must be above {name}.span, which is 3, or 0 for one burst"
+    assert failure(*burst, (f"{name}.every", 3.0)) == message
+    config = RunConfig()
+    for field, value in [*burst, (f"{name}.every", 3.5), (f"{name}.low", 1.0), (f"{name}.high", 1.0)]:
+        config = replaced(config, field, value)
+    check(config)

@@ -1,0 +1,74 @@
+"""What finite worlds share: numbered states and actions, and a random stream of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from env_server.worlds.world import Outcome, Position, Vector
+
+
+class FiniteWorld:
+    """A world whose observation is the state's number and whose action is the action's, one float32 each.
+
+    An action between two numbers counts as the nearer one, and one outside as the nearest: 1.4 is action 1.
+
+    Attributes:
+        random: the stream behind `start` and `transition`; reset(seed) begins it anew.
+    """
+
+    observation_dim = action_dim = 1
+    native_period_s: float | None = None
+    physics_step_s: float | None = None
+    scene = ""
+
+    def __init__(self, *, states: int, actions: int, drift: Callable[[int], float], seed: int) -> None:
+        """`drift` gives the drift's true value in unit t."""
+        self.states = states
+        self.actions = actions
+        self.action_low: Vector = np.array([0.0], np.float32)
+        self.action_high: Vector = np.array([actions - 1.0], np.float32)
+        self.drift = drift
+        self.random = np.random.default_rng(seed)
+        self.state = 0
+
+    def start(self, drift: float) -> int:
+        """The state that an episode begins in, given the drift's value. For subclasses."""
+        raise NotImplementedError
+
+    def transition(self, state: int, action: int, drift: float) -> tuple[int, float, bool]:
+        """(next state, reward, terminated) of one step, given the drift's value over it. For subclasses."""
+        raise NotImplementedError
+
+    def reset(self, seed: int | None, t: int, /) -> Vector:
+        """Begin an episode in unit `t`."""
+        if seed is not None:
+            self.random = np.random.default_rng(seed)
+        self.state = self.start(self.drift(t))
+        return self._observe()
+
+    def step(self, action: Vector, t: int, /) -> Outcome:
+        """Take the action that `action` (float32 [1]) numbers."""
+        number = int(np.clip(np.rint(action[0]), 0, self.actions - 1))
+        drift = self.drift(t)
+        self.state, reward, terminated = self.transition(self.state, number, drift)
+        return Outcome(self._observe(), reward, terminated, truncated=False, drift=drift)
+
+    def physics(self, _t: int, /) -> tuple[float, ...]:
+        """There is none."""
+        return ()
+
+    def position(self) -> Position:
+        """Nothing to draw."""
+        return np.zeros(0)
+
+    def save_scene(self, _path: Path, /) -> None:
+        """No file is needed to draw it."""
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def _observe(self) -> Vector:
+        return np.array([self.state], np.float32)
