@@ -25,7 +25,7 @@ def run_sim(argv: Sequence[str]) -> int:
     if config.duration_s == 0:
         raise ConfigError("duration_s", 0, "must be above 0 in virtual time")
     run_dir = RunDir.create(chosen.run_dir or default_path(config), config)
-    from launcher.sim import simulate  # with it comes torch: only now that the command line is right
+    from launcher.sim import simulate  # with it comes all that is heavy: only now
 
     console, stop = Console(), Stop()
     console.print(f"run  {run_dir.path}", highlight=False, soft_wrap=True)

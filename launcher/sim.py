@@ -14,7 +14,7 @@ from agent_service.service import AgentService
 from env_server.service import EnvService
 from env_server.worlds.registry import make_world
 from launcher.summary import StatsByProcess
-from learner.arithmetic import prepare
+from learner.algorithm import prepare
 from learner.service import LearnerService
 from recorder.service import RecorderService
 from rtcore import channels
@@ -37,7 +37,7 @@ class Simulation:
     def __init__(self, config: RunConfig, run_dir: RunDir, stack: ExitStack) -> None:
         """`stack` closes what is opened here, in reverse order."""
         self._config = config
-        prepare(config.learner.threads)
+        prepare(config.learner)
         self._clock = VirtualClock(START_NS)
         self._hub = MemoryHub()
         self._buses: dict[str, Bus] = {}

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import sys
 
-import torch
-
-from learner.arithmetic import prepare
+from learner.algorithm import prepare
 from learner.power import Levers
 from learner.service import LearnerService
 from rtcore import channels, realtime
@@ -15,14 +13,14 @@ from rtcore.process import Process, background, run_process
 
 def serve(process: Process) -> None:
     """Learn, then write the checkpoint."""
-    prepare(process.config.learner.threads)
+    set_threads = prepare(process.config.learner)
     service = LearnerService(
         process.config,
         process.run_dir,
         process.bus,
         process.clock,
         process.ledger,
-        levers=Levers(realtime.allowed_cores(), torch.set_num_threads, realtime.pin),
+        levers=Levers(realtime.allowed_cores(), set_threads, realtime.pin),
     )
     process.bus.serve(channels.LEARNER, service.command)
     process.bus.declare_alive(channels.LEARNER)

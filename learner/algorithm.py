@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from learner.checkpoint import State
-from learner.deep.fsac import Fsac
-from learner.deep.sac import Sac
 from learner.replay import Replay
-from rtcore.config import RunConfig
+from rtcore.config import Algo, ConfigError, LearnerConfig, RunConfig
 from rtcore.messages import Architecture
 from rtcore.spaces import Spaces
 from rtcore.windows import Window
+
+TABULAR: tuple[Algo, ...] = ("q", "fq", "npg", "tempo")  # for finite worlds
+DEEP: tuple[Algo, ...] = ("sac", "fsac", "rsac")  # for continuous ones
 
 
 class Algorithm(Protocol):
@@ -23,8 +25,9 @@ class Algorithm(Protocol):
     Attributes:
         algo: its name in the configuration and in published policies.
         architecture: of the policy that `policy_arrays` gives.
-        gradient_steps: calls of `update` so far, checkpoints included.
-        policy_steps: how many of them improved the policy.
+        gradient_steps: made by `update` so far, checkpoints included: one a call, of a table as many as it
+            learned transitions.
+        policy_steps: how often the policy was improved, by `update` or by `iterate`.
     """
 
     algo: str
@@ -35,8 +38,10 @@ class Algorithm(Protocol):
     def update(self, *, improve_policy: bool) -> None:
         """One gradient step on one batch: critics and targets, and with `improve_policy` the policy.
 
+        A table learns instead from the transitions that it has not read yet, if there are any.
+
         Raises:
-            ValueError: the replay holds no transition.
+            ValueError: the replay holds no transition to draw.
         """
 
     def iterate(self, g: int) -> bool:
@@ -76,7 +81,59 @@ def make_algorithm(run: RunConfig, spaces: Spaces, seed: int, replay: Replay) ->
     Raises:
         ConfigError: it does not fit the world's spaces.
     """
+    fitting = TABULAR if spaces.finite else DEEP
+    if run.learner.algo not in fitting:
+        kind = "finite" if spaces.finite else "continuous"
+        allowed = f"must be one of {', '.join(fitting)}: {run.env.id} is a {kind} world"
+        raise ConfigError("learner.algo", run.learner.algo, allowed)
+    make = _make_table if spaces.finite else _make_network
+    return make(run, spaces, seed, replay)
+
+
+def prepare(config: LearnerConfig) -> Callable[[int], None]:
+    """Settle how this process computes, once, before `make_algorithm`.
+
+    PyTorch, which takes seconds to load, is loaded only for an algorithm with networks.
+
+    Returns:
+        What sets the number of the arithmetic's threads.
+    """
+    if config.algo in TABULAR:
+        return lambda _: None  # numpy, on one thread
+    from learner import arithmetic
+
+    arithmetic.prepare(config.threads)
+    return arithmetic.set_threads
+
+
+def _make_table(run: RunConfig, spaces: Spaces, seed: int, replay: Replay) -> Algorithm:
+    from learner.tabular.fq import Fq
+    from learner.tabular.npg import Npg
+    from learner.tabular.q import QLearning
+    from learner.tabular.tempo import Tempo
+
     config = run.learner
-    if config.algo == "fsac":
-        return Fsac(config, spaces.observation_dim, spaces.action_dim, seed, replay)
-    return Sac(config, spaces.observation_dim, spaces.action_dim, seed, replay)
+    match config.algo:
+        case "fq":
+            return Fq(config, spaces, seed, replay)
+        case "npg":
+            return Npg(config, spaces, seed, replay)
+        case "tempo":
+            return Tempo(config, spaces, seed, replay)
+        case _:
+            return QLearning(config, spaces, seed, replay)
+
+
+def _make_network(run: RunConfig, spaces: Spaces, seed: int, replay: Replay) -> Algorithm:
+    from learner.deep.fsac import Fsac
+    from learner.deep.rsac import Rsac
+    from learner.deep.sac import Sac
+
+    config = run.learner
+    match config.algo:
+        case "fsac":
+            return Fsac(config, spaces.observation_dim, spaces.action_dim, seed, replay)
+        case "rsac":
+            return Rsac(config, spaces, seed, replay, run.env.reward)
+        case _:
+            return Sac(config, spaces.observation_dim, spaces.action_dim, seed, replay)

@@ -1,4 +1,4 @@
-"""How many gradient steps the learner may make: the update-to-data limit."""
+"""How much the learner may learn: the update-to-data limit of gradient steps; of a table, all that came."""
 
 from __future__ import annotations
 
@@ -36,6 +36,33 @@ class UpdateBudget:
         """Whether one more gradient step may be made in this phase."""
         return self._credit >= 1.0 and (phase == "update" or self._hold_share > 0.0)
 
-    def spend(self) -> None:
-        """One gradient step was made."""
-        self._credit -= 1.0
+    def spend(self, steps: int = 1) -> None:
+        """So many gradient steps were made."""
+        self._credit -= steps
+
+
+class TableBudget:
+    """A table learns from each transition once, as it comes; update-to-data limits mean nothing to it.
+
+    In a hold with `hold_learning` "off" nothing is learned; what came is learned in the next update phase.
+    """
+
+    def __init__(self, config: LearnerConfig) -> None:
+        self._hold_share = SHARE[config.hold_learning]
+        self._waiting = True  # an earlier learner may have left something
+
+    def resume(self, transitions: int) -> None:
+        """What an earlier learner left is looked for anyway."""
+
+    def earn(self, transitions: int, phase: Phase) -> None:
+        """Take note of new transitions in the replay."""
+        del phase
+        self._waiting |= transitions > 0
+
+    def allows(self, phase: Phase) -> bool:
+        """Whether there may be something to learn in this phase."""
+        return self._waiting and (phase == "update" or self._hold_share > 0.0)
+
+    def spend(self, steps: int = 1) -> None:
+        """So many transitions were learned; none: nothing waits any more."""
+        self._waiting = steps > 0

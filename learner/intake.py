@@ -46,6 +46,8 @@ class Intake:
         low, high = np.asarray(spec.action_low), np.asarray(spec.action_high)
         self._middle = ((high + low) / 2).astype(np.float32)
         self._half_span = ((high - low) / 2).astype(np.float32)
+        if spec.actions:  # numbered: nothing to scale
+            self._middle, self._half_span = np.zeros(1, np.float32), np.ones(1, np.float32)
 
     def place(self) -> str:
         """Where in the log the intake stands, for `go_on_from` in a later learner."""

@@ -11,8 +11,8 @@ from collections import deque
 from typing import assert_never
 
 from learner import resume
-from learner.algorithm import Algorithm, make_algorithm
-from learner.budget import UpdateBudget
+from learner.algorithm import TABULAR, Algorithm, make_algorithm
+from learner.budget import TableBudget, UpdateBudget
 from learner.conductor import (
     Conductor,
     Happening,
@@ -68,7 +68,7 @@ class LearnerService:
         self.outbox = Outbox(bus, run_dir, clock, ledger)
         self._windows = WindowClock(make_schedule(config.learner.schedule), round(config.env.unit_s * 1e9))
         self._conductor = Conductor(self._windows)
-        self._budget = UpdateBudget(config.learner)
+        self._budget = (TableBudget if config.learner.algo in TABULAR else UpdateBudget)(config.learner)
         self._power = PowerControl(config.learner, levers, ledger)
         self._notices: list[WindowNotice] = []
         self._publication = Publication(config.learner.algo, self._notices, self.outbox, ledger)
@@ -149,15 +149,15 @@ class LearnerService:
         self._power.watch(steps, now_ns)
 
     def _improve(self, algorithm: Algorithm) -> None:
-        """One gradient step."""
+        """One gradient step; of a table, as many as transitions wait."""
         begin_ns = self._clock.now_ns()
-        improve = self._phase == "update"
-        steps, policy_steps = algorithm.gradient_steps, algorithm.policy_steps
-        algorithm.update(improve_policy=improve)
-        self._budget.spend()
-        self._publication.improved |= improve
-        self._ledger.count("gradient_steps", algorithm.gradient_steps - steps)
-        self._ledger.count("policy_steps", algorithm.policy_steps - policy_steps)
+        steps, policy_steps = -algorithm.gradient_steps, -algorithm.policy_steps
+        algorithm.update(improve_policy=self._phase == "update")
+        steps, policy_steps = steps + algorithm.gradient_steps, policy_steps + algorithm.policy_steps
+        self._budget.spend(steps)
+        self._publication.improved |= policy_steps > 0
+        self._ledger.count("gradient_steps", steps)
+        self._ledger.count("policy_steps", policy_steps)
         self._note_duration(self._clock.now_ns() - begin_ns)
 
     def _meet(self, spec: Spec) -> None:

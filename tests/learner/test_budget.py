@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from learner.budget import UpdateBudget
+from learner.budget import TableBudget, UpdateBudget
 from rtcore.config import LearnerConfig
 from rtcore.messages import Phase
 
@@ -55,3 +55,23 @@ def test_a_resumed_learner_does_not_wait_again() -> None:
     budget.resume(7)
     budget.earn(5, "update")
     assert spend_all(budget) == 2
+
+
+def test_a_table_goes_on_until_an_update_finds_nothing_new() -> None:
+    budget = TableBudget(LearnerConfig(algo="q", utd=0.1, learning_starts=1000))
+    assert budget.allows("update")  # an earlier learner may have left something
+    budget.spend(1000)
+    assert budget.allows("hold")
+    budget.spend(0)
+    assert not budget.allows("update")
+    budget.earn(0, "update")
+    assert not budget.allows("update")
+    budget.earn(1, "hold")
+    assert budget.allows("hold")
+
+
+def test_what_a_table_may_not_learn_in_a_hold_waits_for_the_next_update_phase() -> None:
+    budget = TableBudget(LearnerConfig(algo="q", hold_learning="off"))
+    budget.earn(5, "hold")
+    assert not budget.allows("hold")
+    assert budget.allows("update")
