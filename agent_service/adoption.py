@@ -9,7 +9,8 @@ from collections import deque
 
 import numpy as np
 
-from agent_service.inference import Array, TanhGaussianPolicy
+from agent_service.inference import ActingPolicy, Array, TanhGaussianPolicy
+from agent_service.tables import CategoricalPolicy
 from rtcore.ledger import Ledger
 from rtcore.messages import Policy, Spec
 from rtcore.spaces import Spaces
@@ -24,13 +25,13 @@ class Adoption:
     """
 
     def __init__(self, spec: Spec, ledger: Ledger) -> None:
-        self._spec = spec
+        self._spaces = Spaces.of(spec)
         self._ledger = ledger
         self._low: Array = np.asarray(spec.action_low, np.float32)
         self._high: Array = np.asarray(spec.action_high, np.float32)
         self._newest_version = 0
         # One place; pop and append are atomic, so the two threads need no lock.
-        self._ready: deque[tuple[TanhGaussianPolicy, Policy]] = deque()
+        self._ready: deque[tuple[ActingPolicy, Policy]] = deque()
 
     def offer(self, policy: Policy, now_ns: int) -> None:
         """Check a policy and make it ready; a bad one is refused, counted and reported."""
@@ -49,17 +50,19 @@ class Adoption:
             self._ledger.count("policies.superseded")
         self._ready.append((ready, policy))
 
-    def take(self) -> tuple[TanhGaussianPolicy, Policy] | None:
+    def take(self) -> tuple[ActingPolicy, Policy] | None:
         """The policy that is ready for the swap, once."""
         try:
             return self._ready.pop()
         except IndexError:
             return None
 
-    def _prepare(self, policy: Policy) -> TanhGaussianPolicy:
+    def _prepare(self, policy: Policy) -> ActingPolicy:
         if policy.version < self._newest_version:
             raise WeightsError(f"version {self._newest_version} was there before")
-        arrays = verify(policy, Spaces.of(self._spec))
+        arrays = verify(policy, self._spaces)
+        if self._spaces.finite:
+            return CategoricalPolicy(policy.version, arrays["probability"])
         ready = TanhGaussianPolicy(policy.version, policy.architecture, arrays, self._low, self._high)
         ready.warm_up()
         return ready

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 
 import numpy as np
@@ -10,6 +11,7 @@ from agent_service.adoption import Adoption
 from agent_service.evidence import Evidence
 from agent_service.freshness import Freshness
 from agent_service.inference import ActingPolicy, UniformPolicy
+from agent_service.tables import UniformChoice
 from rtcore import channels
 from rtcore.bus import Bus, Received
 from rtcore.clock import Clock
@@ -106,7 +108,7 @@ class AgentService:
             self._ledger.count("observations.unknown")
             return
         assert self._spec is not None
-        fits = len(step.observation) == 4 * self._spec.observation_dim
+        fits = _fits(step.observation, self._spec)
         if step.rehearsal and fits:
             self._respond(received, self._rehearsal_rng)
             self._ledger.count("rehearsals")
@@ -205,7 +207,17 @@ class AgentService:
     def _meet(self, spec: Spec) -> None:
         if self._spec is None:  # a later one is the same world in a new incarnation
             low, high = np.asarray(spec.action_low, np.float32), np.asarray(spec.action_high, np.float32)
-            self._policy = UniformPolicy(low, high)
+            self._policy = UniformChoice(spec.actions) if spec.states else UniformPolicy(low, high)
             self._adoption = Adoption(spec, self._ledger)
         self._freshness = Freshness(spec.tick_ns)
         self._spec = spec
+
+
+def _fits(observation: bytes, spec: Spec) -> bool:
+    """Whether it is one of this world's: as long as declared, and in a finite one a state's number."""
+    if len(observation) != 4 * spec.observation_dim:
+        return False
+    if not spec.states:
+        return True
+    state: float = struct.unpack_from("<f", observation)[0]
+    return 0 <= state < spec.states and state.is_integer()

@@ -1,6 +1,7 @@
 """Presets: functions that return a whole run configuration, found by the entry points in pyproject.toml.
 
-`run` fills in the preset's name; every value can be overridden on the command line.
+Those of the finite worlds are in `experiments.finite_presets`. `run` fills in the preset's name; every value
+can be overridden on the command line.
 """
 
 from __future__ import annotations
@@ -13,9 +14,14 @@ from rtcore.config import (
     ForecastConfig,
     LearnerConfig,
     RewardConfig,
+    RewardModelConfig,
     RunConfig,
     ScheduleConfig,
 )
+
+# Where Gymnasium's observations hold the forward speed, for `rsac`.
+_HALFCHEETAH = RewardModelConfig(speed_entry=8)
+_SWIMMER = RewardModelConfig(speed_entry=3)
 
 
 def halfcheetah() -> RunConfig:
@@ -46,6 +52,7 @@ def halfcheetah() -> RunConfig:
             critic_lr=3e-3,
             alpha_lr=3e-3,
             replay_units=60.0,
+            reward=_HALFCHEETAH,
         ),
     )
 
@@ -73,6 +80,7 @@ def halfcheetah_authors() -> RunConfig:
             learning_starts=10_000,
             schedule=ScheduleConfig(kind="fixed", l_f=10, gamma_f=0.7),
             forecast=ForecastConfig(kind="forq", l_p=10, basis="identity"),
+            reward=_HALFCHEETAH,
         ),
     )
 
@@ -88,6 +96,7 @@ def swimmer() -> RunConfig:
             drift=DriftConfig(kind="sine", offset=0.1, amplitude=0.1, omega=2 * math.pi / 120),
             reward=RewardConfig(control_cost=1e-4),
         ),
+        learner=LearnerConfig(reward=_SWIMMER),
     )
 
 

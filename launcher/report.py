@@ -123,7 +123,7 @@ def _learning(summary: Summary) -> RenderableType:
         ("windows", f"{len(windows)}" + (f" ({shape})" if windows else "")),
         (
             "updates",
-            f"{learner['gradient_steps']:,}, of which {learner['policy_steps']:,} of the policy; "
+            f"{learner['gradient_steps']:,} of Q, {learner['policy_steps']:,} of the policy; "
             f"{drawing.number(learner['updates_per_s'], 1)} /s",
         ),
         (

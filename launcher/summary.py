@@ -210,10 +210,11 @@ def _run_time_s(env: Totals, config: RunConfig) -> float:
 
 
 def _forecast(gauges: Mapping[str, float]) -> Summary:
-    """None where no forecast was judged."""
+    """Means over the windows judged, None where none was; `trust` is the share of the forecast at the end."""
     windows = gauges.get("forecast/windows")
     return {
         "windows": None if windows is None else int(windows),
         "error": gauges.get("forecast/error"),
         "baseline_error": gauges.get("forecast/baseline_error"),
+        "trust": gauges.get("forecast/trust"),
     }

@@ -1,6 +1,7 @@
 """What the learner remembers: the newest transitions, in a ring of preallocated arrays.
 
-One thread owns a `Replay`. Actions are in [-1, 1]: whoever adds a transition has scaled them.
+One thread owns a `Replay`. Actions are in [-1, 1], whoever adds a transition has scaled them; those of a
+finite world are their numbers.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from learner.recency import RecentUnits
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -138,32 +141,64 @@ class Replay:
         """How many of the newest transitions belong to `unit` or later."""
         units = self._columns.unit
         newer = units[: self._head]  # written since the ring last wrapped, in order
-        count = self._head - int(np.searchsorted(newer, unit))
+        sought = np.int32(unit)  # of the column's type: for any other, the whole column would be converted
+        count = self._head - int(np.searchsorted(newer, sought))
         if count == self._head and self._size == self.capacity:
             older = units[self._head :]
-            count += len(older) - int(np.searchsorted(older, unit))
+            count += len(older) - int(np.searchsorted(older, sought))
         return count
 
-    def sample(self, rng: np.random.Generator, batch: Batch, since_unit: int | None = None) -> None:
-        """Fill `batch` with transitions drawn uniformly, with replacement.
+    def sample(
+        self,
+        rng: np.random.Generator,
+        batch: Batch,
+        since_unit: int | None = None,
+        recency: float | None = None,
+    ) -> None:
+        """Fill `batch` with transitions drawn with replacement: uniformly, or the newer the likelier.
 
         Args:
             rng: where the draw comes from.
             batch: filled in place.
             since_unit: draw only from this unit and later ones; None: from all.
+            recency: draw a unit by its age first, exponential with this mean in units, then uniformly
+                within the unit (`learner.recency`); None: uniformly.
 
         Raises:
             ValueError: there is no transition to draw from.
         """
-        count = self._size if since_unit is None else self.count_since(since_unit)
-        if count == 0:
-            raise ValueError(f"since_unit = {since_unit}: no transition to draw from, {self._size} held")
-        rows = rng.integers(0, count, len(batch.reward))
+        count = self._count_from(since_unit)
+        if recency is None:
+            rows = rng.integers(0, count, len(batch.reward))
+        else:
+            rows = self._by_age(count).rows(rng.random((2, len(batch.reward))), recency)
         rows += self._head - count  # from -capacity on: a negative row counts from the ring's end
         for column in fields(batch):
             # mode="wrap" resolves the negative rows, and unlike "raise" writes to `out` unbuffered
             stored, drawn = getattr(self._columns, column.name), getattr(batch, column.name)
             np.take(stored, rows, axis=0, out=drawn, mode="wrap")
+
+    def mean_unit(self, since_unit: int | None = None, recency: float | None = None) -> float:
+        """The mean unit of what `sample` draws, asked the same way.
+
+        Raises:
+            ValueError: there is no transition to draw from.
+        """
+        count = self._count_from(since_unit)
+        if recency is not None:
+            return self._by_age(count).mean_unit(recency)
+        rows = np.arange(self._head - count, self._head)
+        return float(np.take(self._columns.unit, rows, mode="wrap").mean())
+
+    def _count_from(self, since_unit: int | None) -> int:
+        count = self._size if since_unit is None else self.count_since(since_unit)
+        if count == 0:
+            raise ValueError(f"since_unit = {since_unit}: no transition to draw from, {self._size} held")
+        return count
+
+    def _by_age(self, count: int) -> RecentUnits:
+        units, end = self._columns.unit, self._head or self._size
+        return RecentUnits(units[end : self._size], units[:end], count)
 
     def content_hash(self) -> str:
         """SHA-256 over the transitions held, oldest first."""

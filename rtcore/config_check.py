@@ -257,6 +257,10 @@ def _check_algorithm(learner: LearnerConfig) -> None:
 
 
 def _check_forecast(forecast: ForecastConfig) -> None:
+    if forecast.parity == "authors" and forecast.distil:
+        raise ConfigError(
+            "learner.forecast.distil", True, "must be false with parity 'authors': it has no copies"
+        )
     columns = {
         "constant": 1,
         "identity": 2,

@@ -1,15 +1,14 @@
 """Forecasting soft actor-critic (paper, Algorithm 2): SAC whose policy climbs a forecast Q.
 
-At the start t_m of a window, ForQ combines frozen copies of past critics into
-Qtilde = sum_k w_k min(Q1_k, Q2_k), the Q function expected `horizon` units after t_m. It replaces
-the live critics in the policy's loss alone, and stays the same until the next window. Critics and
-targets learn as in SAC. The paper prints SAC with a separate V network; this is the form with
-target critics instead.
+At the start t_m of a window, ForQ combines past critics into Qtilde = sum_k w_k min(Q1_k, Q2_k), the Q
+function expected `horizon` units after t_m. It replaces the live critics in the policy's loss alone, and
+stays the same until the next window. Critics and what they bootstrap from learn as in SAC. With
+`trust = "judged"` the policy climbs rho Qtilde + (1 - rho) min(Q1, Q2), see `learner.forecast.judge`.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -18,68 +17,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.checkpoint import State
-from learner.deep.critic_history import CriticHistory, Snapshot
+from learner.deep.critic_forecast import Forecast
+from learner.deep.critic_history import CriticHistory
 from learner.deep.distil import Distilled
-from learner.deep.gradients import Pass, climb, smaller
+from learner.deep.gradients import smaller
 from learner.deep.networks import Adam, FlatParameters
 from learner.deep.sac import Sac
-from learner.forecast.forq import forq_weights
+from learner.forecast.forq import fit, horizon
+from learner.forecast.judge import Judge
 from learner.replay import Replay
 from rtcore.config import LearnerConfig
 from rtcore.windows import Window
 
 
-@dataclass(frozen=True, slots=True)
-class Forecast:
-    """Qtilde of one window.
-
-    Attributes:
-        window: whose t_m the forecast was made at.
-        horizon: h in units; the forecast is of Q at t_m + h.
-        weights: w_k, one per snapshot.
-        snapshots: the past critics, oldest first.
-    """
-
-    window: Window
-    horizon: float
-    weights: tuple[float, ...]
-    snapshots: tuple[Snapshot, ...]
-
-    def value(self, room: Pass) -> Tensor:
-        """Qtilde at the inputs in `room`, [B]."""
-        total = torch.zeros(len(room.input))
-        for weight, snapshot in zip(self.weights, self.snapshots, strict=True):
-            total.add_(smaller(room.forward(snapshot.net)), alpha=weight)
-        return total
-
-    def climb(self, room: Pass, action_dim: int) -> tuple[Tensor, Tensor]:
-        """Qtilde at the inputs in `room`, [B], and its gradient in the action, [B, A].
-
-        A plain loop: evaluating all snapshots in one batched product took 1.6 to 1.9 times as long
-        on a CPU (l_p = 5 to 20, B = H = 256).
-        """
-        total, gradient = torch.zeros(len(room.input)), torch.zeros(len(room.input), action_dim)
-        for weight, snapshot in zip(self.weights, self.snapshots, strict=True):
-            value, slope = climb(room, snapshot.net, action_dim)
-            total.add_(value, alpha=weight)
-            gradient.add_(slope, alpha=weight)
-        return total, gradient
-
-
-@dataclass(slots=True)
-class Judgement:
-    """How forecasts made at t_m compared with the critics reached at t_{m+1}, over the windows so far.
-
-    Errors are root mean squares over a batch of remembered (s, a), in units of Q.
-    """
-
-    windows: int = 0
-    error_sum: float = 0.0
-    baseline_error_sum: float = 0.0  # of the newest critic known at t_m, taken as it was
-
-
 class Fsac(Sac):
-    """The FSAC learner. Until its first forecast, or without one, it is SAC bit for bit."""
+    """The FSAC learner. Until its first forecast, or while it does not trust it, it is SAC bit for bit.
+
+    With `parity = "authors"` the past critics are aliases of the live ones. The weights sum to 1, so
+    Qtilde = (sum_k w_k) Q = Q: it is SAC throughout.
+    """
 
     algo = "fsac"
 
@@ -87,9 +43,12 @@ class Fsac(Sac):
         self, config: LearnerConfig, observation_dim: int, action_dim: int, seed: int, replay: Replay
     ) -> None:
         super().__init__(config, observation_dim, action_dim, seed, replay)
-        self._history = CriticHistory(config.forecast.l_p, self._precision)
+        forecast = config.forecast
+        self._history = CriticHistory(
+            forecast.l_p, self._critic, self._critic_net, aliases=forecast.parity == "authors"
+        )
         self._forecast: Forecast | None = None
-        self._judgement = Judgement()
+        self._judge = Judge(forecast.trust)
 
     def _build_passes(self) -> None:
         super()._build_passes()
@@ -99,9 +58,10 @@ class Fsac(Sac):
         self._distilled = Distilled(widths, self._config.batch, self._precision) if distil else None
 
     def end_unit(self, unit: int) -> None:
-        """Unit t ended: keep a copy of the critics. Critics that have not learnt yet are not kept."""
-        if self._config.forecast.kind != "none" and self.gradient_steps > 0:
-            self._history.push(unit + 1, self._critic)
+        """Unit t ended: keep the critics, every so many units; not those that have not learnt yet."""
+        config = self._config.forecast
+        if config.kind != "none" and self.gradient_steps > 0 and (unit + 1) % config.every == 0:
+            self._history.push(unit + 1)
 
     def begin_window(self, window: Window, unit: int) -> None:
         """Window m was entered in `unit`: judge the last forecast, then make this window's.
@@ -114,66 +74,90 @@ class Fsac(Sac):
         if previous is not None and (previous.window.m, previous.window.start) == (window.m, window.start):
             return
         if previous is not None and previous.window.end == window.start == unit and len(self._replay):
-            self._judge(previous)
+            self._judge_forecast(previous)
         self._forecast = None
         snapshots = self._history.snapshots
         if config.kind == "none" or not snapshots:
             return
-        # a window without an end has only its update phase for a length
-        length = float(window.update if window.hold is None else window.update + window.hold)
-        horizon = config.horizon if isinstance(config.horizon, float | int) else length
-        times = [snapshot.time - window.start for snapshot in snapshots]
-        weights = forq_weights(times, horizon, basis=config.basis, shrink=config.shrink)
-        self._forecast = forecast = Forecast(window, horizon, tuple(weights.tolist()), snapshots)
+        times = [float(snapshot.time - window.start) for snapshot in snapshots]
+        ahead, end = horizon(config, window, self._replay_age(window.start)), window.end
+        weights = fit(config, times, ahead)
+        judged = weights if end is None else fit(config, times, end - window.start)
+        newest = snapshots[-1]
+        self._forecast = forecast = Forecast(
+            window,
+            ahead,
+            tuple(weights.tolist()),
+            tuple(judged.tolist()),
+            snapshots,
+            before=newest if newest.time == unit else self._history.take(unit),
+        )
         if self._distilled is not None:
             critics = [snapshot.parameters for snapshot in snapshots]
             self._distilled.restart(forecast.weights, critics)
 
-    def _judge(self, forecast: Forecast) -> None:
+    def _replay_age(self, unit: int) -> float:
+        """Mean age in units, at the start of `unit`, of the transitions that the critics learn from."""
+        if not len(self._replay):
+            return 0.0
+        since, recency = self._since_unit(), self._config.replay_recency
+        return max(0.0, unit - (self._replay.mean_unit(since, recency) + 0.5))
+
+    def _judge_forecast(self, forecast: Forecast) -> None:
+        """Compare it with the critics reached, at remembered states and actions that nothing learnt from:
+        half of them the policy's, half drawn uniformly.
+        """
         self._draw_batch("judge")
+        observation = self._sampled.observation
+        action = self._propose(self._now, observation, "judge").action
+        drawn = action[len(action) // 2 :]
+        drawn.copy_(torch.from_numpy(self._rng["judge"].uniform(-1, 1, drawn.shape).astype(np.float32)))
         room = self._values
-        reached = smaller(self._evaluate(self._critic_net, self._sampled.observation, self._sampled.action))
-        before = smaller(room.forward(forecast.snapshots[-1].net))
-        error = (forecast.value(room) - reached).square().mean().sqrt().item()
-        baseline = (before - reached).square().mean().sqrt().item()
-        self._judgement.windows += 1
-        self._judgement.error_sum += error
-        self._judgement.baseline_error_sum += baseline
+        reached = smaller(self._evaluate(self._critic_net, observation, action))
+        before = smaller(room.forward(forecast.before.net))
+        error = (forecast.value(room, forecast.judged_weights) - reached).square().mean().sqrt().item()
+        self._judge.hear(error, (before - reached).square().mean().sqrt().item())
 
     def _climb(self) -> tuple[Tensor, Tensor]:
-        if self._forecast is None or self._config.forecast.trust == "never":
+        share = self._judge.share
+        if self._forecast is None or share == 0:
             return super()._climb()
+        value, slope = self._climb_forecast(self._forecast)
+        if share == 1:
+            return value, slope
+        live_value, live_slope = super()._climb()
+        return live_value.lerp_(value, share), live_slope.lerp_(slope, share)
+
+    def _climb_forecast(self, forecast: Forecast) -> tuple[Tensor, Tensor]:
         inputs, action_dim, distilled = self._values.input, self.architecture.action_dim, self._distilled
         if distilled is None:
-            return self._forecast.climb(self._values, action_dim)
+            return forecast.climb(self._values, action_dim)
         exact = distilled.due()
         distilled.steps += 1
         if not exact:
             return distilled.climb(inputs, action_dim)
-        value, slope = self._forecast.climb(self._values, action_dim)
+        value, slope = forecast.climb(self._values, action_dim)
         distilled.fit(inputs, value, slope)
         return value, slope
 
     def metrics(self) -> dict[str, float]:
-        """Those of SAC, and of the forecast.
+        """Those of SAC, and, where there are forecasts, theirs.
 
         forecast/snapshots: critics in the forecast now, 0 without one; forecast/weight_norm: its
-        ||w||_2, by which noise in past critics is amplified; forecast/horizon: h in units;
-        forecast/windows: forecasts judged so far; forecast/error and forecast/baseline_error: means
-        over them, see `Judgement`; forecast/distil_error: root mean square of the distilled forecast
-        minus the exact sum, in standard deviations of the sum, at the policy's actions in the newest
-        batch, before it learns from them; forecast/distil_slope: mean cosine of their slopes in the
-        action there.
+        ||w||_2, by which noise in past critics is amplified (L of Proposition 1); forecast/horizon: h in
+        units; those of `Judge.metrics`, on held-out (s, a); forecast/distil_error: root mean square of
+        the distilled forecast minus the exact sum, in standard deviations of the sum, at the policy's
+        actions in the newest batch, before it learns from them; forecast/distil_slope: mean cosine of
+        their slopes in the action there.
         """
-        found, forecast, judged = super().metrics(), self._forecast, self._judgement
+        found, forecast = super().metrics(), self._forecast
+        if self._config.forecast.kind == "none":
+            return found
+        found |= self._judge.metrics()
         found["forecast/snapshots"] = float(len(forecast.snapshots)) if forecast else 0.0
         if forecast:
             found["forecast/weight_norm"] = float(np.linalg.norm(forecast.weights))
             found["forecast/horizon"] = forecast.horizon
-        found["forecast/windows"] = float(judged.windows)
-        if judged.windows:
-            found["forecast/error"] = judged.error_sum / judged.windows
-            found["forecast/baseline_error"] = judged.baseline_error_sum / judged.windows
         if forecast and self._distilled is not None:
             found |= self._distilled.judged()
         return found
@@ -181,27 +165,28 @@ class Fsac(Sac):
     # -- durability
 
     def state(self) -> State:
-        """That of SAC, with the past critics and the forecast."""
+        """That of SAC, with the past critics, the forecast and what became of those before."""
         base, forecast = super().state(), self._forecast
         scalars = base.scalars | {
             "history": [snapshot.time for snapshot in self._history.snapshots],
-            "judgement": asdict(self._judgement),
+            "judge": self._judge.state(),
             "forecast": None,
             "distilled_steps": self._distilled.steps if self._distilled is not None else None,
         }
         snapshots = {snapshot.time: snapshot for snapshot in self._history.snapshots}
-        tensors = dict(base.tensors)
         if forecast is not None:
-            snapshots |= {snapshot.time: snapshot for snapshot in forecast.snapshots}
+            snapshots |= {snapshot.time: snapshot for snapshot in (*forecast.snapshots, forecast.before)}
             scalars["forecast"] = {
                 "window": asdict(forecast.window),
                 "horizon": forecast.horizon,
                 "weights": list(forecast.weights),
+                "judged_weights": list(forecast.judged_weights),
                 "history": [snapshot.time for snapshot in forecast.snapshots],
+                "before": forecast.before.time,
             }
-        for time, snapshot in snapshots.items():
-            for name, value in snapshot.parameters.views(snapshot.parameters.flat).items():
-                tensors[_tensor_name(time, name)] = value.numpy().copy()
+        tensors = dict(base.tensors)
+        for snapshot in snapshots.values():
+            tensors |= self._history.tensors(snapshot)
         return State(tensors, scalars)
 
     def load(self, state: State) -> None:
@@ -212,9 +197,9 @@ class Fsac(Sac):
         """
         super().load(state)
         saved = state.scalars["forecast"]
-        kept = {time: self._saved_snapshot(state, time) for time in _times(state)}
+        kept = {time: self._history.saved(time, state.tensors) for time in _times(state)}
         self._history.restore(tuple(kept[time] for time in state.scalars["history"]))
-        self._judgement = Judgement(**state.scalars["judgement"])
+        self._judge.load(state.scalars["judge"])
         if self._distilled is not None:
             self._distilled.steps = int(state.scalars["distilled_steps"])
             self._distilled.refresh()
@@ -224,14 +209,15 @@ class Fsac(Sac):
                 window=Window(**saved["window"]),
                 horizon=float(saved["horizon"]),
                 weights=tuple(saved["weights"]),
+                judged_weights=tuple(saved["judged_weights"]),
                 snapshots=tuple(kept[time] for time in saved["history"]),
+                before=kept[saved["before"]],
             )
 
     def _expected_tensors(self, state: State) -> dict[str, NDArray[Any]]:
         expected = super()._expected_tensors(state)
         for time in _times(state):
-            for name, value in self._critic.views(self._critic.flat).items():
-                expected[_tensor_name(time, name)] = value.numpy()
+            expected |= self._history.expected(time)
         return expected
 
     def _trained(self) -> dict[str, tuple[FlatParameters, Adam]]:
@@ -240,18 +226,9 @@ class Fsac(Sac):
             found["distilled"] = self._distilled.parameters, self._distilled.adam
         return found
 
-    def _saved_snapshot(self, state: State, time: int) -> Snapshot:
-        parameters = self._critic.frozen_copy()
-        for name, view in parameters.views(parameters.flat).items():
-            view.copy_(torch.from_numpy(state.tensors[_tensor_name(time, name)].copy()))
-        return Snapshot(time, parameters, self._precision)
-
-
-def _tensor_name(time: int, name: str) -> str:
-    return f"history.{time}.{name}"
-
 
 def _times(state: State) -> list[int]:
     """Of every snapshot in `state`: in the history, in the forecast, or in both."""
-    forecast = state.scalars.get("forecast") or {"history": []}
-    return sorted({*state.scalars.get("history", []), *forecast["history"]})
+    forecast = state.scalars.get("forecast")
+    of_forecast = [] if forecast is None else [*forecast["history"], forecast["before"]]
+    return sorted({*state.scalars.get("history", []), *of_forecast})

@@ -3,13 +3,13 @@
 Source: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications". One update goes
 through the temperature, the critics, the actor and the targets, in that order, and the temperature
 that its losses use is the one before its own step; defaults and order are those of
-stable-baselines3, so that both can be compared curve by curve.
+stable-baselines3, so that both can be compared curve by curve. With `value_network` the critics
+bootstrap from a V network, as in the first SAC and in Algorithm 2 of the paper; it learns before them.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.arithmetic import product_type
-from learner.checkpoint import State, require_fit
+from learner.deep.durability import Durable
 from learner.deep.gradients import (
     Mlp,
     Pass,
@@ -29,17 +29,19 @@ from learner.deep.gradients import (
     smaller,
 )
 from learner.deep.networks import Adam, FlatParameters, make_actor, make_twin_critic, policy_arrays
+from learner.deep.seen import Seen
+from learner.deep.temperature import Temperature
 from learner.deep.tensors import BatchTensors
+from learner.deep.value_network import ValueNetwork
 from learner.replay import Replay, make_batch
 from rtcore.config import LearnerConfig
 from rtcore.messages import Architecture
 from rtcore.windows import Window
 
-_SAME = ("algo", "observation_dim", "action_dim", "hidden")  # what a checkpoint must agree on
 _STREAMS = ("init", "batches", "noise", "judge")
 
 
-class Sac:
+class Sac(Durable):
     """The SAC learner. One thread owns it and its replay.
 
     With one torch thread, equal seeds and equal replays give bit-equal results.
@@ -67,11 +69,12 @@ class Sac:
         streams = np.random.SeedSequence(seed).spawn(len(_STREAMS))
         self._rng = {name: np.random.default_rng(s) for name, s in zip(_STREAMS, streams, strict=True)}
         self._build_networks()
-        self._build_temperature()
+        entropy = -float(action_dim) if config.target_entropy is None else config.target_entropy
+        self._temperature = Temperature(config.alpha, config.alpha_lr, entropy)
         self._batch = make_batch(config.batch, observation_dim, action_dim)
         self._sampled = BatchTensors(self._batch)
         self._build_passes()
-        self._last: dict[str, Tensor] = {}  # what `metrics` reads, not yet fetched
+        self._seen = Seen()
 
     def _build_networks(self) -> None:
         shape, hidden = self.architecture, self._config.hidden
@@ -99,16 +102,12 @@ class Sac:
         self._both = Pass(1, 2 * rows, [observation, *hidden, 2 * action], self._precision)
         self._now, self._next = self._both.rows(0, rows), self._both.rows(rows, 2 * rows)
         self._values = Pass(2, rows, [observation + action, *hidden, 1], self._precision)
+        self._value_network: ValueNetwork | None = None
+        if self._config.value_network:
+            self._value_network = ValueNetwork(
+                [observation, *hidden, 1], rows, self._rng["init"], self._config.critic_lr, self._precision
+            )
         self._noise = np.zeros((2 * rows, action), np.float32)
-
-    def _build_temperature(self) -> None:
-        config = self._config
-        self._tuned = config.alpha == "auto"
-        self._fixed_alpha = 1.0 if config.alpha == "auto" else config.alpha
-        self._log_alpha = FlatParameters({"log_alpha": (1,)})  # tuned from alpha = 1 on
-        self._alpha_adam = Adam(self._log_alpha.flat, self._log_alpha.grad, config.alpha_lr)
-        entropy = config.target_entropy
-        self._target_entropy = -float(self.architecture.action_dim) if entropy is None else entropy
 
     # -- learning
 
@@ -121,25 +120,45 @@ class Sac:
             ValueError: the replay holds no transition.
         """
         self._draw_batch()
-        alpha = math.exp(self._log_alpha.flat[0].item()) if self._tuned else self._fixed_alpha
+        if self._value_network is None:
+            self._update_by_targets(self._temperature.value, improve_policy)
+        else:
+            self._update_by_value(self._value_network, self._temperature.value, improve_policy)
+        self.gradient_steps += 1
+        self.policy_steps += improve_policy
+
+    def _update_by_targets(self, alpha: float, improve_policy: bool) -> None:
         if improve_policy:
             now, following = self._propose_both()
             self._temperature_step(now.log_prob)
-            self._critic_step(alpha, following)
+            self._critic_step(self._soft_value(alpha, following))
             self._actor_step(alpha, now)
-            self.policy_steps += 1
         else:
-            self._critic_step(alpha, self._propose_next())
+            following = self._propose(self._next, self._sampled.next_observation)
+            self._critic_step(self._soft_value(alpha, following))
         self._target.flat.lerp_(self._critic.flat, self._config.tau)
         self._target_net.refresh()
-        self.gradient_steps += 1
+
+    def _update_by_value(self, value: ValueNetwork, alpha: float, improve_policy: bool) -> None:
+        batch = self._sampled
+        now = self._propose(self._now, batch.observation)
+        if improve_policy:
+            self._temperature_step(now.log_prob)
+        q = smaller(self._evaluate(self._critic_net, batch.observation, now.action))
+        value.learn(batch.observation, q - alpha * now.log_prob)
+        self._critic_step(value.bootstrap(batch.next_observation))
+        if improve_policy:
+            self._actor_step(alpha, now)
+        value.follow(self._config.tau)
 
     def _draw_batch(self, stream: str = "batches") -> None:
-        since = None
-        if self._config.replay_units is not None:
-            # the unit under way is not whole yet, so it comes on top
-            since = self._replay.newest_unit - math.ceil(self._config.replay_units)
-        self._replay.sample(self._rng[stream], self._batch, since)
+        recency = self._config.replay_recency
+        self._replay.sample(self._rng[stream], self._batch, self._since_unit(), recency)
+
+    def _since_unit(self) -> int | None:
+        """The oldest unit to draw from: the one under way is not whole yet, so it comes on top."""
+        units = self._config.replay_units
+        return None if units is None else self._replay.newest_unit - math.ceil(units)
 
     def _propose_both(self) -> tuple[Proposal, Proposal]:
         """Actions of the policy at s and at s'."""
@@ -150,12 +169,12 @@ class Sac:
         rows = self._config.batch
         return Proposal(*(part[:rows] for part in drawn)), Proposal(*(part[rows:] for part in drawn))
 
-    def _propose_next(self) -> Proposal:
-        """Actions of the policy at s'."""
-        self._next.input.copy_(self._sampled.next_observation)
+    def _propose(self, room: Pass, observation: Tensor, stream: str = "noise") -> Proposal:
+        """Actions of the policy at `observation`, [B, O], which passes through `room`."""
+        room.input.copy_(observation)
         noise = self._noise[: self._config.batch]
-        self._rng["noise"].standard_normal(dtype=np.float32, out=noise)
-        return propose(self._next.forward(self._actor_net)[0], torch.from_numpy(noise))
+        self._rng[stream].standard_normal(dtype=np.float32, out=noise)
+        return propose(room.forward(self._actor_net)[0], torch.from_numpy(noise))
 
     def _evaluate(self, net: Mlp, observation: Tensor, action: Tensor) -> Tensor:
         """Both critics' values, [2, B, 1]; the next pass overwrites them."""
@@ -168,30 +187,24 @@ class Sac:
         self._values.input[:, columns:] = action
 
     def _temperature_step(self, log_prob: Tensor) -> None:
-        """Descend on J(alpha) = -log(alpha) * mean(log pi + target entropy)."""
-        self._last["log_prob"] = log_prob
-        if not self._tuned:
-            return
-        self._last["log_alpha"] = self._log_alpha.flat[0].clone()
-        self._log_alpha.grad[0] = -(log_prob.mean() + self._target_entropy)
-        self._alpha_adam.step()
+        self._seen.log_prob = log_prob
+        self._temperature.step(log_prob)
 
-    def _critic_step(self, alpha: float, following: Proposal) -> None:
-        """Descend on J(Q) = 1/2 sum_i mean (Q_i(s, a) - y)^2, y the soft target."""
-        target = self._soft_target(alpha, following)
-        q = self._evaluate(self._critic_net, self._sampled.observation, self._sampled.action)
+    def _critic_step(self, next_value: Tensor) -> None:
+        """Descend on J(Q) = 1/2 sum_i mean (Q_i(s, a) - y)^2, y = r + gamma (1 - terminated) next value."""
+        batch = self._sampled
+        target = batch.reward + self._config.gamma * next_value.masked_fill(batch.terminated, 0.0)
+        q = self._evaluate(self._critic_net, batch.observation, batch.action)
         d_q = critic_loss_to_output(q, target)
         self._values.to_parameters(self._critic_net, d_q)
         self._critic_adam.step()
         self._critic_net.refresh()
-        self._last["d_q"], self._last["target"] = d_q, target
+        self._seen.d_q, self._seen.target = d_q, target
 
-    def _soft_target(self, alpha: float, following: Proposal) -> Tensor:
-        """Soft target y = r + gamma (1 - terminated) (min_i Qtarget_i(s', a') - alpha log pi(a'|s')), [B]."""
-        batch = self._sampled
-        q = self._evaluate(self._target_net, batch.next_observation, following.action)
-        value = smaller(q) - alpha * following.log_prob
-        return batch.reward + self._config.gamma * value.masked_fill_(batch.terminated, 0.0)
+    def _soft_value(self, alpha: float, following: Proposal) -> Tensor:
+        """min_i Qtarget_i(s', a') - alpha log pi(a'|s'), [B]."""
+        q = self._evaluate(self._target_net, self._sampled.next_observation, following.action)
+        return smaller(q) - alpha * following.log_prob
 
     def _actor_step(self, alpha: float, now: Proposal) -> None:
         """Descend on J(pi) = mean (alpha log pi(a|s) - Q(s, a)), a drawn from pi."""
@@ -201,7 +214,7 @@ class Sac:
         self._now.to_parameters(self._actor_net, d_heads[None])
         self._actor_adam.step()
         self._actor_net.refresh()
-        self._last["value"], self._last["soft"] = value, alpha * now.log_prob
+        self._seen.value, self._seen.soft = value, alpha * now.log_prob
 
     def _climb(self) -> tuple[Tensor, Tensor]:
         """The Q that the policy climbs at (s, a) of the pass, [B], and its gradient in a, [B, A]."""
@@ -227,73 +240,35 @@ class Sac:
     def metrics(self) -> dict[str, float]:
         """What the newest update saw; a name is missing as long as there is nothing to say.
 
-        loss/critic, loss/actor, loss/alpha: J(Q), J(pi), J(alpha) above; alpha: the temperature
-        now; entropy: mean -log pi on the batch; q_mean: mean over batch and critics of Q(s, a).
+        loss/critic, loss/actor, loss/alpha: J(Q), J(pi), J(alpha); loss/value: J(V), with a V network;
+        alpha: the temperature now; entropy: mean -log pi on the batch; q_mean: mean over batch and
+        critics of Q(s, a).
         """
-        last: dict[str, Tensor] = self._last
-        found: dict[str, float] = {}
-        if "d_q" in last:
-            error = last["d_q"] * self._config.batch
-            found["loss/critic"] = 0.5 * error.square().mean(1).sum().item()
-            found["q_mean"] = (error + last["target"][:, None]).mean().item()
-        if "value" in last:
-            found["loss/actor"] = (last["soft"] - last["value"]).mean().item()
-        if "log_prob" in last:
-            found["entropy"] = -last["log_prob"].mean().item()
-        if "log_alpha" in last:
-            found["loss/alpha"] = last["log_alpha"].item() * (found["entropy"] - self._target_entropy)
-        found["alpha"] = self._log_alpha.flat[0].exp().item() if self._tuned else self._fixed_alpha
-        return found
+        found = self._seen.metrics()
+        if "entropy" in found and (loss := self._temperature.loss(found["entropy"])) is not None:
+            found["loss/alpha"] = loss
+        if self._value_network is not None:
+            found |= self._value_network.metrics()
+        return found | {"alpha": self._temperature.value}
 
     # -- durability
 
-    def state(self) -> State:
-        """Everything needed to go on bit for bit, as copies; the replay is not in it."""
-        tensors = {name: view.numpy().copy() for name, view in self._durable().items()}
-        scalars: dict[str, Any] = {
-            "algo": self.algo,
-            "observation_dim": self.architecture.observation_dim,
-            "action_dim": self.architecture.action_dim,
-            "hidden": list(self.architecture.hidden),
-            "gradient_steps": self.gradient_steps,
-            "policy_steps": self.policy_steps,
-            "rng": {name: rng.bit_generator.state for name, rng in self._rng.items()},
-        }
-        return State(tensors, scalars)
-
-    def load(self, state: State) -> None:
-        """Go on from `state`.
-
-        Raises:
-            CheckpointError: it does not fit this configuration; nothing has changed then.
-        """
-        require_fit(state, State(self._expected_tensors(state), self.state().scalars), same=_SAME)
-        for name, view in self._durable().items():
-            view.copy_(torch.from_numpy(state.tensors[name].copy()))
-        for name, rng in self._rng.items():
-            rng.bit_generator.state = state.scalars["rng"][name]
-        self.gradient_steps = int(state.scalars["gradient_steps"])
-        self.policy_steps = int(state.scalars["policy_steps"])
-        self._last = {}
-        for net in (self._actor_net, self._critic_net, self._target_net):
-            net.refresh()
-
-    def _expected_tensors(self, state: State) -> dict[str, NDArray[Any]]:  # noqa: ARG002 (for subclasses)
-        """The tensors that `state`, going by its scalars, should have."""
-        return {name: view.numpy() for name, view in self._durable().items()}
-
-    def _durable(self) -> dict[str, Tensor]:
-        """The tensors that a checkpoint keeps, by name: views, so that `load` writes through them."""
-        durable = {f"target.{name}": view for name, view in self._target.views(self._target.flat).items()}
-        for network, (parameters, optimiser) in self._trained().items():
-            buffers = {"": parameters.flat, "adam.m.": optimiser.moment1, "adam.v.": optimiser.moment2}
-            for kind, buffer in buffers.items():
-                durable |= {f"{network}.{kind}{n}": view for n, view in parameters.views(buffer).items()}
-            durable[f"{network}.adam.steps"] = optimiser.steps
-        return durable
-
     def _trained(self) -> dict[str, tuple[FlatParameters, Adam]]:
         trained = {"actor": (self._actor, self._actor_adam), "critic": (self._critic, self._critic_adam)}
-        if self._tuned:
-            trained["temperature"] = (self._log_alpha, self._alpha_adam)
+        if self._temperature.tuned:
+            trained["temperature"] = (self._temperature.parameters, self._temperature.adam)
+        if self._value_network is not None:
+            trained["value"] = (self._value_network.parameters, self._value_network.adam)
         return trained
+
+    def _followers(self) -> dict[str, FlatParameters]:
+        value = self._value_network
+        return {"target": self._target} if value is None else {"value_target": value.target}
+
+    def _reloaded(self) -> None:
+        self._seen = Seen()
+        self._temperature.forget()
+        if self._value_network is not None:
+            self._value_network.refresh()
+        for net in (self._actor_net, self._critic_net, self._target_net):
+            net.refresh()

@@ -14,42 +14,79 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rtcore.config import Basis
+from rtcore.config import ForecastConfig
+from rtcore.windows import Window
+
+Floats = NDArray[np.float64]
+
+_RANK = 1e-12  # of the times' size: smaller singular values are rounding, as of sin(pi k), and are left out
 
 
-def forq_weights(
-    time_k: Sequence[float], query: float, *, basis: Basis = "identity", shrink: float = 0.0
-) -> NDArray[np.float64]:
+def fit(config: ForecastConfig, time_k: Sequence[float], query: float) -> Floats:
     """Weights of past Q functions in the forecast.
 
-    Times are centred on their mean first. That leaves the fit as it is, makes Phi Phi^T of the
-    identity basis the diagonal (n, Sxx), and so lets `shrink` reach the slope alone:
+    Each basis function but the constant is taken relative to its mean over the past. That leaves the fit
+    as it is, parts the constant from the others, and so lets `shrink` (lambda) reach the others alone:
 
-        w_k = 1/n + (t_q - xbar) (x_k - xbar) / (Sxx + shrink),    Sxx = sum_k (x_k - xbar)^2
+        w = 1/n + Psi^T (Psi Psi^T + lambda I)^+ psi(t_q),    psi(t) = phi(t) - mean_k phi(x_k)
 
-    The weights sum to 1 whatever the shrinkage: shrinking the intercept too would rescale Q.
+    The weights sum to 1 whatever the shrinkage: shrinking the constant too would rescale Q. In the
+    identity basis w_k = 1/n + (t_q - xbar) (x_k - xbar) / (Sxx + lambda), Sxx = sum_k (x_k - xbar)^2.
 
     Args:
+        config: `basis` and its parameters; `shrink`. "constant" averages, "identity" extrapolates a line.
         time_k: [n], n >= 1, when each past Q was reached, in units, relative to t_m.
         query: t_q on the same axis.
-        basis: "constant" averages, "identity" extrapolates a line.
-        shrink: added to Sxx, in units squared, >= 0.
 
     Returns:
-        [n]. With one time, or equal times, there is no slope to fit and it is 1/n each.
+        [n]. With n below the number of basis functions, only the first n of these are fitted. With one
+        time, or equal times, it is 1/n each.
     """
     time = np.asarray(time_k, np.float64)
     assert time.ndim == 1 and len(time) >= 1, "time_k must be [n] with n >= 1"
-    assert shrink >= 0, "shrink must be >= 0"
-    centre = time.mean()
-    phi_k, phi_q = _features(time - centre, basis), _features(np.array([query - centre]), basis)
-    gram = phi_k @ phi_k.T
-    gram[1:, 1:] += shrink * np.eye(len(gram) - 1)
-    weights: NDArray[np.float64] = phi_k.T @ np.linalg.pinv(gram) @ phi_q[:, 0]
-    return weights
+    average: Floats = np.full(len(time), 1.0 / len(time))
+    columns = _features(config, np.append(time, query) - time.mean())[: len(time) - 1]
+    if not len(columns):
+        return average
+    columns -= columns[:, :-1].mean(1, keepdims=True)
+    left, size, right = np.linalg.svd(columns[:, :-1], full_matrices=False)
+    kept = size > _RANK * max(1.0, float(np.abs(time).max()))
+    gain = size[kept] / (size[kept] ** 2 + config.shrink)
+    change: Floats = right[kept].T @ (gain * (left[:, kept].T @ columns[:, -1]))
+    return average + change
 
 
-def _features(time: NDArray[np.float64], basis: Basis) -> NDArray[np.float64]:
-    """Phi: [d, n], the constant first."""
-    one = np.ones_like(time)
-    return np.stack([one] if basis == "constant" else [one, time])
+def horizon(config: ForecastConfig, window: Window, age_units: float) -> float:
+    """How far ahead of t_m a forecast looks, in units.
+
+    Args:
+        config: `horizon`: a number of units; "window", its length, as in the paper, or of its update phase
+            if it never ends; "replay", that and `age_units`.
+        window: which begins at t_m.
+        age_units: mean age of what the Q functions are learned from: they show the world as it was then.
+    """
+    if not isinstance(config.horizon, str):
+        return float(config.horizon)
+    length = float(window.update if window.hold is None else window.update + window.hold)
+    return length + age_units if config.horizon == "replay" else length
+
+
+def _features(config: ForecastConfig, time: Floats) -> Floats:
+    """The basis functions but the constant, [d - 1, n + 1], at `time`, [n + 1]: the past, then the query.
+
+    Each has a slope of at most 1 per unit over the past. `shrink` is then in units squared in every basis.
+    """
+    match config.basis:
+        case "constant":
+            return np.empty((0, len(time)))
+        case "identity":
+            return time[None].copy()
+        case "polynomial":
+            power = np.arange(1.0, config.degree + 1)[:, None]
+            span = float(np.abs(time[:-1]).max()) or 1.0
+            powers: Floats = span / power * (time / span) ** power
+            return powers
+        case "fourier":
+            omega = 2 * np.pi * np.arange(1.0, config.harmonics + 1)[:, None] / config.period
+            waves = np.stack([np.sin(omega * time), np.cos(omega * time)], 1) / omega[:, None]
+            return waves.reshape(-1, len(time))

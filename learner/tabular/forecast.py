@@ -15,7 +15,7 @@ from learner.tabular.table import Table
 from rtcore.config import ForecastConfig
 from rtcore.windows import Window
 
-_TABLES = ("raw", "known", "value")
+_TABLES = ("judged", "known", "value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,15 +26,15 @@ class Forecast:
         window: whose t_m it was made at.
         horizon: h in units; it is of Q at t_m + h.
         weights: w_k, one per past table; none: there was nothing to forecast from, and all is Q at t_m.
-        raw: sum_k w_k Q_k.
+        judged: the same fit read at t_{m+1}, where it is compared with what came.
         known: Q at t_m, what doing without a forecast would be.
-        value: rho raw + (1 - rho) known, rho being the trust that forecasts had earned by then.
+        value: rho sum_k w_k Q_k + (1 - rho) known, rho being the trust that forecasts had earned by then.
     """
 
     window: Window
     horizon: float
     weights: tuple[float, ...]
-    raw: Table
+    judged: Table
     known: Table
     value: Table
 
@@ -76,7 +76,7 @@ class Forecaster:
             return None
         whole = previous is not None and previous.window.end == window.start == unit
         if previous is not None and previous.weights and whole and visited.any():
-            self._judge.hear(_rms(previous.raw - q, visited), _rms(previous.known - q, visited))
+            self._judge.hear(_rms(previous.judged - q, visited), _rms(previous.known - q, visited))
         self.made = self._make(window, q, age_units)
         return self.made
 
@@ -84,12 +84,19 @@ class Forecaster:
         known = q.copy()
         if not self._history:
             return Forecast(window, 0.0, (), known, known, known)
-        ahead = forq.horizon(self._config, window, age_units)
-        weights = forq.fit(self._config, [time - window.start for time in self._history], ahead)
-        raw: Table = np.tensordot(weights, np.stack(list(self._history.values())), 1)
+        times, tables = (
+            [time - window.start for time in self._history],
+            np.stack(list(self._history.values())),
+        )
+        ahead, end = forq.horizon(self._config, window, age_units), window.end
+        weights = forq.fit(self._config, times, ahead)
+        forecast: Table = np.tensordot(weights, tables, 1)
+        judged = forecast
+        if end is not None and end != window.start + ahead:
+            judged = np.tensordot(forq.fit(self._config, times, end - window.start), tables, 1)
         share = self._judge.share
-        value = share * raw + (1.0 - share) * known
-        return Forecast(window, ahead, tuple(weights.tolist()), raw, known, value)
+        value = share * forecast + (1.0 - share) * known
+        return Forecast(window, ahead, tuple(weights.tolist()), judged, known, value)
 
     def metrics(self) -> dict[str, float]:
         """Those of `Judge`, and of the forecast under way.

@@ -71,7 +71,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
             "updates_per_s": 100.0,  # in 2.5 s
             "governor": {"decisions": 0, "limited_share": None},
         },
-        "forecast": {"windows": None, "error": None, "baseline_error": None},
+        "forecast": {"windows": None, "error": None, "baseline_error": None, "trust": None},
         "recorder": {"rows": 900, "dropped": 7},
         "restarts": {"env_server": 0, "agent_service": 0, "learner": 0, "recorder": 0},
         "messages": {"rejected": 3},
@@ -123,9 +123,15 @@ def test_a_run_in_which_nothing_happened() -> None:
 
 def test_a_judged_forecast() -> None:
     stats = whole_run()
-    gauges = {"forecast/windows": 6.0, "forecast/error": 0.5, "forecast/baseline_error": 0.75}
+    gauges = {"windows": 6.0, "error": 0.5, "baseline_error": 0.75, "trust": 0.25, "last_error": 0.1}
+    gauges = {f"forecast/{name}": value for name, value in gauges.items()}
     stats[LEARNER].append(ledger(LEARNER, incarnation=2, gauges=gauges))
-    assert summary_of(stats)["forecast"] == {"windows": 6, "error": 0.5, "baseline_error": 0.75}
+    assert summary_of(stats)["forecast"] == {
+        "windows": 6,
+        "error": 0.5,
+        "baseline_error": 0.75,
+        "trust": 0.25,
+    }
 
 
 def test_counts_that_do_not_reconcile_are_named() -> None:

@@ -14,6 +14,8 @@ UNKNOWN_KEY = "[env]\nherz = 100.0\n"
 OVERLAP = '[learner.schedule]\nkind = "explicit"\nt_m = [0, 5]\ng_m = [6, 2]\n'
 WRONG_RANGE = "[learner.schedule]\ngamma_f = 2.0\n"
 
+PLAIN_PENDULUM = '[env]\nid = "Pendulum-v1"\ndrift.kind = "none"\n'
+
 # The ones that people make most are tried on the real command.
 TYPED = {
     "preset": (["run", "cheetah"], ["preset", "'cheetah'", "halfcheetah, "]),
@@ -32,6 +34,14 @@ TYPED = {
         ["learner.schedule", "6"],
     ),
     "config_missing": (["run", "--config", "none.toml"], ["config", "'none.toml'", "readable"]),
+    "a_network_for_a_table": (
+        ["run", "cliffworld", "--learner.algo", "sac"],
+        ["learner.algo", "'sac'", "q, fq, npg", "cliffworld"],
+    ),
+    "a_table_for_a_network": (
+        ["run", "pointmass", "--learner.algo", "q"],
+        ["learner.algo", "'q'", "sac, fsac, rsac", "pointmass"],
+    ),
 }
 OTHERS = {
     "command": (["rum"], ["command", "'rum'", "run, sim"]),
@@ -52,6 +62,38 @@ OTHERS = {
     "no_run_to_hold": (["hold"], ["run_dir", "runs/"]),
     "no_run_to_report": (["report", "taken"], ["run", "'taken'", "summary.json"]),
     "no_recording_to_view": (["view", "taken"], ["run", "'taken'", "recording.rrd"]),
+    **{
+        f"{algo}_in_{preset}": (["sim", preset, "--learner.algo", algo], ["learner.algo", f"'{algo}'"])
+        for preset, algos in (
+            ("cliffworld", ("fsac", "rsac", "tempo")),
+            ("bandit", ("sac",)),
+            ("random_mdp", ("fsac", "tempo")),
+            ("chain", ("rsac", "tempo")),
+            ("pointmass", ("fq", "npg", "tempo")),
+            ("gym", ("q", "tempo")),
+            ("halfcheetah", ("npg",)),
+        )
+        for algo in algos
+    },
+    "tempo_alone": (["env", "--config", "tempo.toml", "--run-dir", "new"], ["learner.algo", "'tempo'"]),
+    "q_in_cartpole": (
+        ["run", "gym", "--env.id", "CartPole-v1", "--learner.algo", "q"],
+        ["learner.algo", "'q'", "'CartPole-v1'", "tables are for cliffworld, "],
+    ),
+    "eta": (
+        ["run", "chain", "--learner.table.eta", "1.5"],
+        ["learner.table.eta", "1.5", "(1 - learner.gamma) / learner.table.entropy"],
+    ),
+    "gamma_1_npg": (["run", "chain", "--learner.gamma", "1"], ["learner.gamma", "1.0", "below 1 for npg"]),
+    "gamma_1_sac": (["run", "--learner.gamma", "1"], ["learner.gamma", "1.0", "below 1 for sac"]),
+    "states_that_are_observed_with_actions": (
+        ["run", "cliffworld", "--env.observe-actions", "1"],
+        ["env.observe_actions", "1"],
+    ),
+    "states_that_are_observed_with_the_drift": (
+        ["run", "bandit", "--env.notify", "value"],
+        ["env.notify", "'value'"],
+    ),
     "report_of_nothing": (["report"], ["run", "must be given"]),
 }
 
@@ -66,6 +108,7 @@ def somewhere(tmp_path: Path) -> Path:
     (tmp_path / "bad.toml").write_text(BAD_TOML)
     (tmp_path / "key.toml").write_text(UNKNOWN_KEY)
     (tmp_path / "range.toml").write_text(WRONG_RANGE)
+    (tmp_path / "tempo.toml").write_text(PLAIN_PENDULUM + '[learner]\nalgo = "tempo"\n')
     return tmp_path
 
 

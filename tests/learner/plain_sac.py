@@ -47,7 +47,7 @@ class PlainSac:
         s, a, r = (torch.tensor(x) for x in (batch.observation, batch.action, batch.reward))
         s_next, going_on = torch.tensor(batch.next_observation), 1.0 - torch.tensor(batch.terminated).float()
         action, log_prob = self.draw(s)
-        alpha = self.log_alpha.exp().detach() if config.alpha == "auto" else torch.tensor(config.alpha)
+        alpha = self.alpha()
 
         if config.alpha == "auto":
             alpha_loss = -(self.log_alpha * (log_prob.detach() - ACTION_DIM)).mean()
@@ -73,6 +73,10 @@ class PlainSac:
         self.losses |= {"loss/critic": critic_loss.item(), "loss/actor": actor_loss.item()}
         self.losses["entropy"] = -log_prob.mean().item()
 
+    def alpha(self) -> Tensor:
+        config = self.config
+        return self.log_alpha.exp().detach() if config.alpha == "auto" else torch.tensor(config.alpha)
+
     def draw(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = self.actor(observation).chunk(2, dim=1)
         std = log_std.clamp(-20, 2).exp()
@@ -81,6 +85,50 @@ class PlainSac:
         log_normal = torch.log(torch.exp(-(noise**2) / 2) / (std * (2 * torch.pi) ** 0.5))
         log_prob = log_normal - torch.log(1 - torch.tanh(u) ** 2 + 1e-9)
         return torch.tanh(u), log_prob.sum(1)
+
+
+class PlainValueSac(PlainSac):
+    """The first SAC: a V network, which the critics bootstrap from by way of its slow copy."""
+
+    def __init__(self, config: LearnerConfig, state: State, replay: Replay) -> None:
+        super().__init__(config, state, replay)
+        self.value = network([OBSERVATION_DIM, *config.hidden, 1])
+        load(self.value, state.tensors, "value", 0)
+        self.value_target = copy.deepcopy(self.value)
+        self.value_adam = torch.optim.Adam(self.value.parameters(), lr=config.critic_lr)
+
+    def update(self, *, improve_policy: bool = True) -> None:
+        config, batch = self.config, make_batch(self.config.batch, OBSERVATION_DIM, ACTION_DIM)
+        self.replay.sample(self.rng["batches"], batch)
+        s, a, r = (torch.tensor(x) for x in (batch.observation, batch.action, batch.reward))
+        s_next, going_on = torch.tensor(batch.next_observation), 1.0 - torch.tensor(batch.terminated).float()
+        alpha, (action, log_prob) = self.alpha(), self.draw(s)
+
+        if improve_policy:
+            alpha_loss = -(self.log_alpha * (log_prob.detach() - ACTION_DIM)).mean()
+            descend(alpha_loss, self.alpha_adam)
+
+        with torch.no_grad():
+            soft = torch.minimum(*(q(self.critics, i, s, action) for i in range(2))) - alpha * log_prob
+        value_loss = 0.5 * functional.mse_loss(self.value(s)[:, 0], soft)
+        descend(value_loss, self.value_adam)
+
+        with torch.no_grad():
+            target = r + config.gamma * going_on * self.value_target(s_next)[:, 0]
+        critic_loss = sum(0.5 * functional.mse_loss(q(self.critics, i, s, a), target) for i in range(2))
+        assert isinstance(critic_loss, Tensor)
+        descend(critic_loss, self.critic_adam)
+
+        self.losses |= {"loss/critic": critic_loss.item(), "loss/value": value_loss.item()}
+        if improve_policy:
+            best = torch.minimum(*(q(self.critics, i, s, action) for i in range(2)))
+            actor_loss = (alpha * log_prob - best).mean()
+            descend(actor_loss, self.actor_adam)
+            self.losses["loss/actor"] = actor_loss.item()
+
+        with torch.no_grad():
+            for old, new in zip(self.value_target.parameters(), self.value.parameters(), strict=True):
+                old.copy_((1 - config.tau) * old + config.tau * new)
 
 
 def q(critics: list[nn.Sequential], index: int, observation: Tensor, action: Tensor) -> Tensor:

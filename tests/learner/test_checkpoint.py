@@ -100,6 +100,9 @@ CONFIGS = {
     "fsac, distilled": small_config(algo="fsac", forecast=forq(distil=True), precision="bfloat16"),
     "sac, fixed temperature": small_config(alpha=0.2),
     "fsac": small_config(algo="fsac", forecast=forq()),
+    "fsac, judged": small_config(algo="fsac", forecast=forq(trust="judged", every=2)),
+    "fsac, value network": small_config(algo="fsac", forecast=forq(), value_network=True),
+    "sac, recent units": small_config(replay_recency=2.0),
     "fsac, recent replay": small_config(algo="fsac", forecast=forq(l_p=2, shrink=1.0), replay_units=3.0),
 }
 

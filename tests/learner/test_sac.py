@@ -90,6 +90,17 @@ def test_only_the_newest_units_are_sampled() -> None:
     assert set(sac._batch.reward) == {7, 8, 9}  # unit 9 is under way, and two whole ones
 
 
+def test_newer_units_are_sampled_more_often() -> None:
+    sac = make_sac(small_config(replay_recency=1.0, batch=400), filled_replay())
+    sac._draw_batch()
+    old = make_sac(small_config(batch=400), filled_replay())
+    old._draw_batch()
+    newest = filled_replay().read(140, 60).observation  # units 7, 8 and 9 of 0..9
+    shares = [np.isin(one._batch.observation[:, 0], newest[:, 0]).mean() for one in (sac, old)]
+    # ages 0 (units 8 and 9) and 1 of nine: (1 - e^-2) / (1 - e^-9) = 0.86, against 0.3
+    assert shares == pytest.approx([0.86, 0.3], abs=0.07)
+
+
 def test_metrics_before_the_first_update() -> None:
     assert make_sac().metrics() == {"alpha": 1.0}
 

@@ -100,12 +100,24 @@ def test_a_forecast_is_judged_where_there_was_something_to_see() -> None:
     assert metrics["forecast/trust"] == pytest.approx(0.15)  # 0.3 * (1 - 1/2)
 
 
+def test_a_farther_forecast_is_judged_where_the_window_ends() -> None:
+    found, replay = lived(forecast={"horizon": 10.0})
+    found.begin_window(FIRST, 2)
+    assert forecast_of(found) == pytest.approx([-8.0, 1.5])  # the line at t = 12
+    for unit in (2, 3, 4):
+        pull(replay, 0, 0.0, unit=unit)
+        found.update(improve_policy=True)
+        found.end_unit(unit)
+    found.begin_window(window(2, 5, 2, 1), 5)
+    assert found.metrics()["forecast/error"] == pytest.approx(1.0)  # -1 at t = 5, and 0 was reached
+
+
 def test_trust_shrinks_the_forecast_towards_the_table() -> None:
     found, _ = lived(forecast={"trust": "judged"})
     found._forecaster._judge.hear(0.0, 1.0)  # perfect once: rho = 0.3
     found.begin_window(FIRST, 2)
     assert forecast_of(found) == pytest.approx([1.1, 1.5])  # 0.3 * -1 + 0.7 * 2
-    assert found.state().tensors["forecast.raw"][0].tolist() == pytest.approx([-1.0, 1.5])
+    assert found.state().tensors["forecast.judged"][0].tolist() == pytest.approx([-1.0, 1.5])
 
 
 def test_never_trusted_it_is_the_table_frozen_at_the_start() -> None:
