@@ -26,7 +26,7 @@ from rtcore.messages import Action, Command, CommandReply, Step
 from rtcore.pacer import Pacer, Tick
 
 LEAD_NS = 100_000_000  # from announcing T0 to T0, so that the spec is with everybody before step 0
-PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for
+PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for in any case
 PEERS_POLL_S = 0.05
 REMEMBERED_TICKS = 64  # sending times kept, so that a late answer's latency is known too
 ACTIONS_KEPT = (
@@ -136,10 +136,13 @@ class EnvService:
             self._actions.wait(LAST_ANSWER_S)
 
     def wait_for_peers(self, stop: Stop) -> None:
-        """Wait until an agent and a learner are there, `env.start_wait_s` at most."""
+        """Wait until agent and learner are there, and the recorder of a run that is recorded: whoever comes
+        later finds only the newest policy. `env.start_wait_s` at most.
+        """
         wait_s = self._config.env.start_wait_s
+        peers = PEERS | ({channels.RECORDER} if self._config.recorder.record else set())
         limit_ns = self._clock.now_ns() + round(wait_s * 1e9)
-        while missing := PEERS - self._bus.alive():
+        while missing := peers - self._bus.alive():
             now_ns = self._clock.now_ns()
             if now_ns >= limit_ns:
                 names = " and ".join(sorted(missing))

@@ -122,7 +122,7 @@ class EnvConfig:
     on_miss: MissPolicy = "hold"
     hold_ticks: int = 5  # for hold_then_neutral: held so many ticks, then neutral
     count: int = 1
-    start_wait_s: float = 15.0  # T0 waits so long, at most, for an agent and a learner to be there
+    start_wait_s: float = 15.0  # T0 waits so long, at most, for the others to be there
     notify: Notify = "none"  # told of the drift, as a number after the world's observation: 1 in a unit
     # in which target or physics changed, else 0; or the target's value
     drift: DriftConfig = field(default_factory=DriftConfig)

@@ -10,7 +10,7 @@ from hypothesis import settings
 settings.register_profile("tenuto", derandomize=True, deadline=None)
 settings.load_profile("tenuto")
 
-# A suite that is started in the background, or under nohup, inherits ignored signals, and hands them on to the
+# A suite started in the background, or under nohup, inherits ignored signals, and hands them on to the
 # processes that it interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)

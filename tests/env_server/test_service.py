@@ -12,7 +12,7 @@ import pytest
 from env_server.worlds.registry import make_world, resolve
 from rtcore import channels
 from rtcore.clock import VirtualClock
-from rtcore.config import DriftConfig, EnvConfig, RunConfig
+from rtcore.config import DriftConfig, EnvConfig, RecorderConfig, RunConfig
 from rtcore.lifecycle import Stop
 from rtcore.messages import Command, Spec, Step, StepBatch
 from tests.env_server.rig import MISSES, START_NS, TICK_NS, Rig, run_config, silent
@@ -173,10 +173,12 @@ class ImpatientStop(Stop):
         return self.is_set()
 
 
-def test_the_start_waits_for_agent_and_learner_only() -> None:
-    rig = Rig(run_config(start_wait_s=15.0))
+@pytest.mark.parametrize("record", [True, False])
+def test_the_start_waits_for_all_that_belong_to_the_run(record: bool) -> None:
+    rig = Rig(replace(run_config(start_wait_s=15.0), recorder=RecorderConfig(record=record)))
     late = rig.hub.bus("late", rig.clock)
-    rig.hub.bus("recorder", rig.clock).declare_alive(channels.RECORDER)
+    if record:
+        rig.hub.bus("recorder", rig.clock).declare_alive(channels.RECORDER)
     rig.reader.declare_alive(channels.AGENT)
 
     def arrive() -> None:
@@ -193,7 +195,8 @@ def test_the_start_gives_up_waiting_and_says_for_whom() -> None:
     rig.reader.declare_alive(channels.AGENT)
     rig.service.wait_for_peers(ImpatientStop(rig.clock))
     assert rig.clock.now_ns() == START_NS + 1_230_000_000
-    assert [event.text for event in rig.ledger.stats(0).events] == ["starting without learner after 1.23 s"]
+    said = "starting without learner and recorder after 1.23 s"
+    assert [event.text for event in rig.ledger.stats(0).events] == [said]
 
 
 def test_a_stop_while_waiting_ends_the_run_before_it_begins() -> None:

@@ -68,9 +68,7 @@ def test_its_recording_shows_phases_policies_and_every_tick(real: Path) -> None:
     assert [phase.state for phase in phases] == ["update", "hold"] * 8
     assert [phase.start_ns for phase in phases[1:]] == [2 * UNIT_NS * i for i in range(1, 16)]
     published, versions = columns(recording, "/learner/published_version", timeline="run_time")
-    last = summary["policies"]["published"]  # the first ones may have been there before the recorder was
-    assert versions.ravel().tolist() == list(range(last + 1 - len(versions), last + 1))
-    assert len(versions) >= 3
+    assert versions.ravel().tolist() == list(range(1, summary["policies"]["published"] + 1))
     holds = [(phase.start_ns, phase.end_ns) for phase in phases if phase.state == "hold"]
     for instant in published:
         assert not any(start < instant < (end or 2**62) for start, end in holds)
