@@ -59,7 +59,7 @@ def cliffworld() -> RunConfig:
 
 
 def cliffworld_as_published() -> RunConfig:
-    """The cliffworld with the paper's numbers as printed (section 7.1 and appendix).
+    """The cliffworld with the paper's numbers as printed (section 6.2 and appendix).
 
     Printed: a step costs -100, the goal pays 100, a restart costs -100; at most 100 steps an episode; the
     goal switches at step 10 000 of 20 000; (0.1, 0.1) is one of its six pairs of step size and epsilon.

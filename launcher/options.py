@@ -103,6 +103,8 @@ def _resolved(config: RunConfig) -> RunConfig:
     check(config)
     resolved = replace(config, env=worlds.resolve(config.env))
     check(resolved)  # again, now that hz and speed are both known
+    if config.learner.algo == "rsac":
+        worlds.require_speed(resolved.env, config.learner.reward)
     return resolved
 
 

@@ -87,7 +87,7 @@ class RewardConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CliffConfig:
-    """What the paper leaves open about its cliffworld (section 7.1, appendix). Defaults: docs/paper.md."""
+    """What the paper leaves open about its cliffworld (section 6.2, appendix); see docs/cliffworld.md."""
 
     pays: Literal["arrive", "leave"] = "leave"  # the reward of a cell comes on entering or on leaving it
     inactive_goal: Literal["ordinary", "terminal"] = "terminal"

@@ -17,7 +17,7 @@ from rtcore.config import ConfigError, Rounding, ScheduleConfig
 from rtcore.messages import Phase
 
 # l_f * gamma_f is a product of decimals: 20 * 0.15 or 15 * 0.6 may land 2e-15 beside the integer that is
-# meant. 1e-9 is far above that error and far below any share that a person writes (notes: section 4.2).
+# meant. 1e-9 is far above that error and far below any share that a person writes.
 PRODUCT_TOLERANCE = 1e-9
 
 

@@ -1,6 +1,6 @@
 """Small finite MDPs that elapse with time and whose variation budgets are known exactly.
 
-A time-elapsing MDP (paper, section 2) keeps its states and actions, while R_t and P_t depend on the unit t.
+A time-elapsing MDP (paper, section 3) keeps its states and actions, while R_t and P_t depend on the unit t.
 Here both lie on the line between two ends:
 
     R_t = (1 - w_t) R_A + w_t R_B,    P_t = (1 - w_t) P_A + w_t P_B,    w_t in [0, 1] from the drift's value
@@ -106,7 +106,7 @@ class DriftingMdp(FiniteWorld):
         return self._at(self.drift(t))
 
     def budgets(self, units: int) -> tuple[Floats, Floats]:
-        """The local variation budgets of the first `units` units (paper, section 2), exactly.
+        """The local variation budgets of the first `units` units (paper, section 3), exactly.
 
         Returns:
             b_r[t] = max over (s, a) of |R_{t+1} - R_t|, and b_p[t] = max over (s, a) of

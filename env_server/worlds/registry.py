@@ -6,6 +6,7 @@ Importing this module loads no simulator; each world's own module is imported wh
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from env_server.worlds.period import Timing, physics_steps, resolve_period
 from env_server.worlds.physics import Factors, Physics, check_physics
 from env_server.worlds.world import World
 from rtcore import channels
-from rtcore.config import Algo, ConfigError, DriftConfig, EnvConfig
+from rtcore.config import Algo, ConfigError, DriftConfig, EnvConfig, RewardModelConfig
 
 # The walkers that get a drifting target speed, with Gymnasium's own time scale, and what of their physics
 # can drift. A test compares these with the simulator; they are repeated here so that a command line can be
@@ -61,6 +62,26 @@ def require_fit(env: EnvConfig, algo: Algo) -> None:
         fitting, others = _BANDIT_ALGOS if env.id == BANDIT else _FINITE_ALGOS, ", whose states are numbered"
     if algo not in fitting:
         raise ConfigError("learner.algo", algo, f"one of {', '.join(fitting)} for {env.id!r}{others}")
+
+
+def require_speed(env: EnvConfig, reward: RewardModelConfig) -> None:
+    """The declared family of rewards belongs to worlds with a target speed, and reads the speed from an
+    observation of a resolved `env`.
+
+    Raises:
+        ConfigError: this world has no target speed, or its observation no such entry.
+    """
+    if reward.model == "learned":
+        return
+    if _is_plain_gym(env):
+        allowed = (
+            f"must be 'learned' for {env.id!r} without a drift: its reward is not that of a target speed"
+        )
+        raise ConfigError("learner.reward.model", reward.model, allowed)
+    with closing(make_world(env, 0)) as world:
+        if reward.speed_entry >= world.observation_dim:
+            allowed = f"must be below {world.observation_dim}, the numbers in an observation of {env.id!r}"
+            raise ConfigError("learner.reward.speed_entry", reward.speed_entry, allowed)
 
 
 def make_world(env: EnvConfig, seed: int) -> World:

@@ -1,4 +1,4 @@
-"""Q-learning with the forecast of its future table (paper, sections 6.1 and 7.1)."""
+"""Q-learning with the forecast of its future table (paper, sections 6.1 and 6.2)."""
 
 from __future__ import annotations
 

@@ -86,6 +86,14 @@ OTHERS = {
     ),
     "gamma_1_npg": (["run", "chain", "--learner.gamma", "1"], ["learner.gamma", "1.0", "below 1 for npg"]),
     "gamma_1_sac": (["run", "--learner.gamma", "1"], ["learner.gamma", "1.0", "below 1 for sac"]),
+    "a_speed_that_is_not_observed": (
+        ["run", "pointmass", "--learner.algo", "rsac", "--learner.reward.speed-entry", "1"],
+        ["learner.reward.speed_entry", "1", "below 1"],
+    ),
+    "a_family_of_another_world": (
+        ["run", "gym", "--learner.algo", "rsac"],
+        ["learner.reward.model", "'declared'", "'learned'", "'Pendulum-v1'"],
+    ),
     "states_that_are_observed_with_actions": (
         ["run", "cliffworld", "--env.observe-actions", "1"],
         ["env.observe_actions", "1"],
