@@ -22,8 +22,8 @@ from typing import Any
 import tyro
 
 from benchmarks.baselines import baseline, still
-from benchmarks.intervals import check_seeds, half_interval
 from env_server.worlds.registry import resolve
+from experiments.intervals import interval
 from experiments.presets import halfcheetah
 from launcher.sim import simulate
 from rtcore.config import RunConfig, ScheduleConfig
@@ -75,7 +75,8 @@ def last_half(returns: list[float]) -> float:
 
 def main(arguments: Arguments) -> None:
     """Run everything, print and write the table."""
-    check_seeds(arguments.seeds)
+    if arguments.seeds < 2:
+        raise SystemExit(f"seeds = {arguments.seeds}: must be 2 or more, for an interval")
     seeds = range(arguments.seeds)
     preset = configure("preset", 0)
     floor = last_half(baseline(preset, still, round(preset.duration_s * (preset.env.hz or 0.0))))
@@ -84,11 +85,9 @@ def main(arguments: Arguments) -> None:
         pending = {change: [pool.submit(score, change, seed) for seed in seeds] for change in CHANGES}
         for change, runs in pending.items():
             found[change] = [run.result() for run in runs]
-            mean, half = statistics.fmean(found[change]), half_interval(found[change])
-            print(
-                f"{change:22} {mean:6.2f} ± {half:4.2f}   {[round(one, 2) for one in found[change]]}",
-                flush=True,
-            )
+            of_seeds = interval(found[change])
+            scores = [round(one, 2) for one in found[change]]
+            print(f"{change:22} {of_seeds.mean:6.2f} ± {of_seeds.half:4.2f}   {scores}", flush=True)
     print(f"{'standing still':22} {floor:6.2f}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"{datetime.now(UTC):%Y-%m-%d}-halfcheetah_settings.json"

@@ -27,7 +27,7 @@ import torch
 import tyro
 from stable_baselines3.common.monitor import Monitor
 
-from benchmarks.intervals import check_seeds, half_interval
+from experiments.intervals import interval
 from experiments.presets import gym
 from launcher.sim import simulate
 from rtcore.config import LearnerConfig, Precision, RunConfig
@@ -101,14 +101,15 @@ def score(returns: list[float]) -> float:
 def compare(ours: list[float], theirs: list[float]) -> dict[str, float]:
     """Mean difference and its 95 % Student interval, paired by seed."""
     differences = [a - b for a, b in zip(ours, theirs, strict=True)]
-    mean = statistics.fmean(differences)
-    half = half_interval(differences)
+    of_seeds = interval(differences)
+    mean, half = of_seeds.mean, of_seeds.half
     return {"difference": mean, "low": mean - half, "high": mean + half}
 
 
 def main(arguments: Arguments) -> None:
     """Run both on every seed, print the table, write the result."""
-    check_seeds(arguments.seeds)
+    if arguments.seeds < 2:
+        raise SystemExit(f"seeds = {arguments.seeds}: must be 2 or more, for an interval")
     seeds = range(arguments.seeds)
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         ours_runs = [
