@@ -22,7 +22,6 @@ from rtcore.messages import Action, Command, CommandReply, Policy, Spec, Step
 
 WAIT_S = 0.2  # how long a wait may last before `stop`, or a failure, is looked at
 AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's
-REHEARSAL_STREAM = 3  # of rehearsals
 
 
 class AgentService:
@@ -50,7 +49,6 @@ class AgentService:
         self._last_published = last_published
         self._ledger = ledger
         self._rng = np.random.default_rng([config.seed, AGENT_STREAM])
-        self._rehearsal_rng = np.random.default_rng([config.seed, REHEARSAL_STREAM])
         self._specs = bus.latest(channels.SPEC, name)
         self._policies = bus.queue(channels.POLICY, capacity=64)
         self._actions = bus.publisher(channels.ACTION, name)
@@ -110,7 +108,7 @@ class AgentService:
         assert self._spec is not None
         fits = _fits(step.observation, self._spec)
         if step.rehearsal and fits:
-            self._respond(received, self._rehearsal_rng)
+            self._respond(received)
             self._ledger.count("rehearsals")
             return
         self._ledger.count("observations")
@@ -120,17 +118,17 @@ class AgentService:
         if not fits:
             self._ledger.count("observations.invalid")
             return
-        self._respond(received, self._rng)
+        self._respond(received)
         self._reaction.record(self._clock.now_ns() - received.received_ns)
         self._ledger.count("actions")
 
-    def _respond(self, received: Received[Step], rng: np.random.Generator) -> None:
+    def _respond(self, received: Received[Step]) -> None:
         """The path from an observation to its action, which a rehearsal takes too: so a swap, and what is
         cold after it, are paid for between two ticks."""
         step = received.message
         self._swap(step)
         assert self._policy is not None
-        action = self._policy.act(np.frombuffer(step.observation, np.float32), rng)
+        action = self._policy.act(np.frombuffer(step.observation, np.float32), self._rng)
         excuse = self._evidence.excuse(received.received_ns, settle=not step.rehearsal)
         self._actions.put(
             Action(

@@ -176,7 +176,8 @@ def _windows(notices: Iterable[WindowNotice]) -> list[Summary]:
 
 
 def _transitions(env: Totals, learner: Totals) -> Summary:
-    produced, learned = env.counters["produced"], learner.counters["learned"]
+    produced = env.counters["produced"]
+    learned = learner.counters["learned"] - learner.counters["unread"]  # what never reached the table is lost
     return {
         "produced": produced,
         "learned": learned,

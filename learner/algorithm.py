@@ -10,13 +10,10 @@ from numpy.typing import NDArray
 
 from learner.checkpoint import State
 from learner.replay import Replay
-from rtcore.config import Algo, ConfigError, LearnerConfig, RunConfig
+from rtcore.config import DEEP, TABULAR, ConfigError, LearnerConfig, RunConfig
 from rtcore.messages import Architecture
 from rtcore.spaces import Spaces
 from rtcore.windows import Window
-
-TABULAR: tuple[Algo, ...] = ("q", "fq", "npg", "tempo")  # for finite worlds
-DEEP: tuple[Algo, ...] = ("sac", "fsac", "rsac")  # for continuous ones
 
 
 class Algorithm(Protocol):
@@ -28,12 +25,14 @@ class Algorithm(Protocol):
         gradient_steps: made by `update` so far, checkpoints included: one a call, of a table as many as it
             learned transitions.
         policy_steps: how often the policy was improved, by `update` or by `iterate`.
+        unread: transitions that were overwritten in the replay before a table could learn from them.
     """
 
     algo: str
     architecture: Architecture
     gradient_steps: int
     policy_steps: int
+    unread: int
 
     def update(self, *, improve_policy: bool) -> None:
         """One gradient step on one batch: critics and targets, and with `improve_policy` the policy.

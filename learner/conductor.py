@@ -69,12 +69,18 @@ class Conductor:
         self._shown: tuple[int, Phase] | None = None  # window and phase, as last announced
         self._settled = (-1, 0)  # newest iterate that was due: (window, g)
         self._paused = False
+        self._worked = False  # the policy was to be improved at some time of the present unit
         self.position: Position | None = None
 
     @property
     def improving(self) -> bool:
         """Whether the policy is to be improved now."""
         return self.position is not None and self.position.phase == "update" and not self._paused
+
+    @property
+    def paused(self) -> bool:
+        """Whether an operator holds the policy."""
+        return self._paused
 
     def pause(self, run_time_ns: int) -> list[Happening]:
         """An operator's hold: no improvement and nothing published until `resume`."""
@@ -84,6 +90,7 @@ class Conductor:
     def resume(self, run_time_ns: int) -> list[Happening]:
         """Back to what the schedule says."""
         self._paused = False
+        self._worked |= self.improving
         return self._phase_change(run_time_ns, "operator")
 
     def advance(self, run_time_ns: int, lead_ns: int) -> list[Happening]:
@@ -110,7 +117,9 @@ class Conductor:
             iterate = (previous.window.m, previous.iterate)
             if previous.phase == "update" and iterate > self._settled:
                 self._settled = iterate
-                found.append(PublishMissed(*self._iterate(previous)))
+                if self._worked:  # a unit that an operator held throughout misses nothing
+                    found.append(PublishMissed(*self._iterate(previous)))
+        self._worked = self.improving
         if previous is None or previous.window.m != now.window.m:
             found.append(WindowEntered(now.window, now.unit))
         return found + self._phase_change(run_time_ns, "operator" if self._paused else "schedule")

@@ -11,7 +11,7 @@ from collections import deque
 from typing import assert_never
 
 from learner import resume
-from learner.algorithm import TABULAR, Algorithm, make_algorithm
+from learner.algorithm import Algorithm, make_algorithm
 from learner.budget import TableBudget, UpdateBudget
 from learner.conductor import (
     Conductor,
@@ -30,7 +30,7 @@ from learner.replay import open_replay
 from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.clock import Clock
-from rtcore.config import RunConfig
+from rtcore.config import TABULAR, RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.messages import Command, CommandReply, Phase, Spec, WindowNotice
@@ -40,8 +40,9 @@ from rtcore.windows import WindowClock, make_schedule
 
 IDLE_WAIT_S = 0.02  # nothing to learn from: wait so long for the next batch (they come every 50 ms)
 DRAIN_LIMIT_S = 2.0  # after the stop: wait so long for the env server's last batch
-LEAD_FLOOR_NS = 50_000_000  # publish at least so long before the unit ends; an idle wait fits in twice
+LEAD_FLOOR_NS = 50_000_000  # publish at least so long before the unit ends, or a quarter of a shorter unit
 METRICS_PERIOD_NS = 250_000_000
+COUNTED = ("gradient_steps", "policy_steps", "unread")  # of the algorithm, into the ledger
 LEARNER_STREAM = 2  # keeps the learner's random numbers apart from the world's and the agent's
 
 
@@ -76,7 +77,7 @@ class LearnerService:
         self._spec: Spec | None = None
         self._on_time = False  # the learner was there before T0: the first window begins on the dot
         self._algorithm: Algorithm | None = None
-        self._lead_ns = LEAD_FLOOR_NS
+        self._lead_ns = self._lead_floor_ns = LEAD_FLOOR_NS
         self._metrics_due_ns = 0
         self._progress: deque[tuple[int, int]] = deque(maxlen=5)  # (instant, gradient steps), 4 a second
 
@@ -88,7 +89,7 @@ class LearnerService:
                 self.step()
             elif not self.step():
                 pause_s = self._power.pause_s(self._clock.now_ns())
-                self._intake.wait(min(pause_s or IDLE_WAIT_S, IDLE_WAIT_S))
+                self._intake.wait(min(pause_s or IDLE_WAIT_S, IDLE_WAIT_S, self._lead_ns / 2e9))
         deadline = time.monotonic() + DRAIN_LIMIT_S
         while self._spec is not None and not self._intake.ended and time.monotonic() < deadline:
             self._intake.wait(IDLE_WAIT_S)
@@ -151,13 +152,13 @@ class LearnerService:
     def _improve(self, algorithm: Algorithm) -> None:
         """One gradient step; of a table, as many as transitions wait."""
         begin_ns = self._clock.now_ns()
-        steps, policy_steps = -algorithm.gradient_steps, -algorithm.policy_steps
+        before = {name: getattr(algorithm, name) for name in COUNTED}
         algorithm.update(improve_policy=self._phase == "update")
-        steps, policy_steps = steps + algorithm.gradient_steps, policy_steps + algorithm.policy_steps
-        self._budget.spend(steps)
-        self._publication.improved |= policy_steps > 0
-        self._ledger.count("gradient_steps", steps)
-        self._ledger.count("policy_steps", policy_steps)
+        done = {name: getattr(algorithm, name) - count for name, count in before.items()}
+        self._budget.spend(done["gradient_steps"])
+        self._publication.improved |= done["policy_steps"] > 0
+        for name, count in done.items():
+            self._ledger.count(name, count)
         self._note_duration(self._clock.now_ns() - begin_ns)
 
     def _meet(self, spec: Spec) -> None:
@@ -167,6 +168,7 @@ class LearnerService:
                 self._ledger.event(self._clock.now_ns(), "WARN", text)
             return
         self._spec = spec
+        self._lead_ns = self._lead_floor_ns = min(LEAD_FLOOR_NS, spec.unit_ns // 4)
         learner = self._config.learner
         self._power.meet(spec.tick_ns, self._clock.now_ns())
         directory = self._run_dir.learner_dir / resume.REPLAY_DIR
@@ -222,7 +224,8 @@ class LearnerService:
                 self._iterate(self._algorithm, iterate)
                 self._publication.publish(self._algorithm, happening, spec, self._clock, self._windows)
             case PublishMissed(window, iterate):
-                self._iterate(self._algorithm, iterate)
+                if not self._conductor.paused:
+                    self._iterate(self._algorithm, iterate)
                 self._publication.withhold(window.m, iterate, self._clock.now_ns())
             case _:
                 assert_never(happening)
@@ -263,7 +266,7 @@ class LearnerService:
 
     def _note_duration(self, duration_ns: int) -> None:
         """Keep the publication lead above the time that a step takes (slowly forgotten maximum)."""
-        self._lead_ns = max(LEAD_FLOOR_NS, 2 * duration_ns, round(0.99 * self._lead_ns))
+        self._lead_ns = max(self._lead_floor_ns, 2 * duration_ns, round(0.99 * self._lead_ns))
 
     def _ledger_metrics(self, algorithm: Algorithm) -> None:
         for name, value in algorithm.metrics().items():

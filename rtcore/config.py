@@ -24,6 +24,8 @@ DriftKind = Literal[
 ]
 Notify = Literal["none", "changed", "value"]
 Algo = Literal["sac", "fsac", "rsac", "q", "fq", "npg", "tempo"]
+TABULAR: tuple[Algo, ...] = ("q", "fq", "npg", "tempo")  # for finite worlds
+DEEP: tuple[Algo, ...] = ("sac", "fsac", "rsac")  # for continuous ones
 Basis = Literal["constant", "identity", "polynomial", "fourier"]
 MissPolicy = Literal["hold", "neutral", "hold_then_neutral"]
 ScheduleKind = Literal["fixed", "explicit"]

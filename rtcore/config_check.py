@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from rtcore.config import ConfigError, DriftConfig, ForecastConfig, LearnerConfig, RunConfig
+from rtcore.config import DEEP, TABULAR, ConfigError, DriftConfig, ForecastConfig, LearnerConfig, RunConfig
 from rtcore.windows import make_schedule
 
 MOST = 10**9  # of anything counted; as seconds (31 years) its nanoseconds still fit a 64-bit message field
@@ -101,19 +101,20 @@ _ENDPOINT = _text(
 )
 _POSITIVE = _number("(0, inf)")
 _FINITE = _number("(-inf, inf)")
+_MODERATE = _number("[-1e12, 1e12]")  # sums and products with any unit stay finite
 
 
 def _drift(prefix: str) -> dict[str, Rule]:
     fields = {
-        "offset": _FINITE,
-        "amplitude": _FINITE,
-        "omega": _FINITE,
-        "phase": _FINITE,
-        "at": _or_word("random", _FINITE),
+        "offset": _MODERATE,
+        "amplitude": _MODERATE,
+        "omega": _MODERATE,
+        "phase": _MODERATE,
+        "at": _or_word("random", _MODERATE),
         "span": _POSITIVE,
         "every": _number("[0, inf)"),
         "rate": _number("(0, 1]"),
-        "sd": _number("[0, inf)"),
+        "sd": _number("[0, 1e12]"),
         "low": _optional(_FINITE),
         "high": _optional(_FINITE),
         "seed": _optional(_whole(0, 2**32 - 1)),
@@ -247,7 +248,10 @@ def _check_drift(name: str, drift: DriftConfig) -> None:
 
 def _check_algorithm(learner: LearnerConfig) -> None:
     table = learner.table
-    if learner.gamma == 1 and learner.algo not in ("q", "fq", "tempo"):
+    if learner.algo in TABULAR and learner.hold_learning == "half":
+        allowed = f"must be 'full' or 'off' for {learner.algo}: a table learns from each transition once"
+        raise ConfigError("learner.hold_learning", "half", allowed)
+    if learner.gamma == 1 and (learner.algo in DEEP or learner.algo == "npg"):
         raise ConfigError("learner.gamma", learner.gamma, f"must be below 1 for {learner.algo}")
     # the largest eta itself may land a rounding above it: 1 - 0.9 is 0.09999999999999998
     if learner.algo == "npg" and table.eta * table.entropy > (1 - learner.gamma) * (1 + 1e-9):

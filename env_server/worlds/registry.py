@@ -16,7 +16,7 @@ from env_server.worlds.period import Timing, physics_steps, resolve_period
 from env_server.worlds.physics import Factors, Physics, check_physics
 from env_server.worlds.world import World
 from rtcore import channels
-from rtcore.config import Algo, ConfigError, DriftConfig, EnvConfig, RewardModelConfig
+from rtcore.config import DEEP, TABULAR, Algo, ConfigError, DriftConfig, EnvConfig, RewardModelConfig
 
 # The walkers that get a drifting target speed, with Gymnasium's own time scale, and what of their physics
 # can drift. A test compares these with the simulator; they are repeated here so that a command line can be
@@ -27,9 +27,6 @@ SPEED_WORLDS = {
 }
 TUNABLE = {"HalfCheetah-v5": ("mass", "friction", "gravity"), "Swimmer-v5": ("mass",)}
 
-_CONTINUOUS_ALGOS: tuple[Algo, ...] = ("sac", "fsac", "rsac")
-_FINITE_ALGOS: tuple[Algo, ...] = ("q", "fq", "npg")
-_BANDIT_ALGOS: tuple[Algo, ...] = (*_FINITE_ALGOS, "tempo")
 
 _STEP_OVERHEAD = 1024  # bytes of a step besides observation, actions and position
 
@@ -57,9 +54,10 @@ def require_fit(env: EnvConfig, algo: Algo) -> None:
     Raises:
         ConfigError: the algorithm cannot learn in this world.
     """
-    fitting, others = _CONTINUOUS_ALGOS, f"; tables are for {', '.join(FINITE_WORLDS)}"
+    fitting, others = DEEP, f"; tables are for {', '.join(FINITE_WORLDS)}"
     if env.id in FINITE_WORLDS:
-        fitting, others = _BANDIT_ALGOS if env.id == BANDIT else _FINITE_ALGOS, ", whose states are numbered"
+        everywhere = tuple(name for name in TABULAR if name != "tempo")
+        fitting, others = TABULAR if env.id == BANDIT else everywhere, ", whose states are numbered"
     if algo not in fitting:
         raise ConfigError("learner.algo", algo, f"one of {', '.join(fitting)} for {env.id!r}{others}")
 

@@ -6,7 +6,8 @@ with z in the place of the target v_d(t):
     r(s', a; z) = healthy - |k_f v' - z| - control_cost |a|^2
 
 v' is the speed in the observation after the step. The environment rewards the mean speed over the step:
-the same in `pointmass` at its native period, an approximation in HalfCheetah and Swimmer.
+the same in `pointmass` at its native period, an approximation in HalfCheetah and Swimmer. With delayed
+actions, a is the one decided and not the one that was under way: the cost is an approximation then.
 """
 
 from __future__ import annotations

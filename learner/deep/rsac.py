@@ -188,8 +188,8 @@ def acting_lead(window: Window | None, unit: int) -> float:
 
     The policy published at the end of a unit acts in the next one: 1. The last one of an update phase
     acts through the hold of N units and on until the next window's first is published, so in N + 1 units,
-    whose middle is 1 + N/2 away. In the hold the critics keep that aim. A hold without an end has no
-    middle: 1.
+    whose middle is 1 + N/2 away. In the hold, where only the critics learn, the lead stays. A hold without
+    an end has no middle: 1.
     """
     if window is None or not window.hold or unit < window.hold_start - 1:
         return 1.0

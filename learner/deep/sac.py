@@ -66,6 +66,7 @@ class Sac(Durable):
         )
         self.gradient_steps = 0
         self.policy_steps = 0
+        self.unread = 0  # batches are drawn
         streams = np.random.SeedSequence(seed).spawn(len(_STREAMS))
         self._rng = {name: np.random.default_rng(s) for name, s in zip(_STREAMS, streams, strict=True)}
         self._build_networks()

@@ -28,7 +28,7 @@ class Forecast:
         weights: w_k, one per past table; none: there was nothing to forecast from, and all is Q at t_m.
         judged: the same fit read at t_{m+1}, where it is compared with what came.
         known: Q at t_m, what doing without a forecast would be.
-        value: rho sum_k w_k Q_k + (1 - rho) known, rho being the trust that forecasts had earned by then.
+        value: sum_k w_k Q_k.
     """
 
     window: Window
@@ -94,9 +94,21 @@ class Forecaster:
         judged = forecast
         if end is not None and end != window.start + ahead:
             judged = np.tensordot(forq.fit(self._config, times, end - window.start), tables, 1)
+        return Forecast(window, ahead, tuple(weights.tolist()), judged, known, forecast)
+
+    @property
+    def alone(self) -> bool:
+        """Whether there is a forecast, and it is trusted so far that `trusted` is nothing else."""
+        return self.made is not None and bool(self.made.weights) and self._judge.share == 1
+
+    def trusted(self, plain: Table) -> Table:
+        """Rho Qtilde + (1 - rho) Q, [S, A], with `plain` for Q and rho the trust that forecasts have earned
+        by this window; `plain` itself where there is no forecast, or no trust in it.
+        """
         share = self._judge.share
-        value = share * forecast + (1.0 - share) * known
-        return Forecast(window, ahead, tuple(weights.tolist()), judged, known, value)
+        if self.made is None or not self.made.weights or share == 0:
+            return plain
+        return share * self.made.value + (1.0 - share) * plain
 
     def metrics(self) -> dict[str, float]:
         """Those of `Judge`, and of the forecast under way.

@@ -67,18 +67,21 @@ class ForecastingQ(QLearning):
 class Fq(ForecastingQ):
     """The policy is epsilon-greedy of the forecast, the same for the whole window.
 
-    Until there is a past table to forecast from, or with forecast.kind "none", it is `QLearning`. With
+    As far as the forecast is not trusted, the rest is Q as it is now. So until there is a past table to
+    forecast from, with forecast.kind "none" and with no trust at all it is `QLearning`. With
     table.write_back = w the forecast also goes into the table: Q <- (1 - w) Q + w Qtilde, at t_m.
 
     Attributes:
-        policy_steps: policies that were made from a forecast, on top of what `QLearning` counts.
+        policy_steps: policies made from a forecast alone, on top of what `QLearning` counts.
     """
 
     algo = "fq"
 
     def _acting(self) -> Table:
-        made = self._forecaster.made
-        return made.value if made is not None and made.weights else self._q
+        return self._forecaster.trusted(self._q)
+
+    def _follows_q(self) -> bool:
+        return not self._forecaster.alone
 
     def _forecast_made(self) -> None:
         value = self._acting()
@@ -90,7 +93,7 @@ class Fq(ForecastingQ):
         self._changed = True
 
     def iterate(self, g: int) -> bool:
-        """Say whether the policy changed since this was last asked: with a forecast, once a window."""
+        """Say whether the policy changed since this was last asked: wholly on a forecast, once a window."""
         changed = super().iterate(g)
-        self.policy_steps += changed and self._acting() is not self._q
+        self.policy_steps += changed and self._forecaster.alone
         return changed

@@ -32,7 +32,7 @@ class Npg(ForecastingQ):
     def __init__(self, config: LearnerConfig, spaces: Spaces, seed: int, replay: Replay) -> None:
         super().__init__(config, spaces, seed, replay)
         self._log_policy: Table = np.full(self._q.shape, -np.log(spaces.actions))
-        self._done = 0  # iterations made in this window
+        self._newest = 0  # iterate of this window that was made last
 
     def update(self, *, improve_policy: bool) -> None:
         """Learn Q from the transitions not read yet; the policy is improved by `iterate` alone."""
@@ -40,22 +40,27 @@ class Npg(ForecastingQ):
         super().update(improve_policy=False)
 
     def _forecast_made(self) -> None:
-        self._done = 0
+        self._newest = 0
 
     def iterate(self, g: int) -> bool:
-        """Improve the policy until `g` iterations of this window are done; say whether any was missing."""
-        made, before = self._forecaster.made, self._done
-        while made is not None and self._done < g:
-            self._log_policy[...] = npg_step(
-                self._log_policy,
-                made.value,
-                eta=self._config.table.eta,
-                entropy=self._config.table.entropy,
-                gamma=self._config.gamma,
-            )
-            self._done += 1
-        self.policy_steps += self._done - before
-        return self._done > before
+        """One iteration of the policy, unless this iterate was made before; says whether it was not.
+
+        Units that were not lived in the update phase, because an operator held the policy or the learner
+        came late, have no iteration, then or later.
+        """
+        made = self._forecaster.made
+        if made is None or g <= self._newest:
+            return False
+        self._log_policy[...] = npg_step(
+            self._log_policy,
+            self._forecaster.trusted(made.known),
+            eta=self._config.table.eta,
+            entropy=self._config.table.entropy,
+            gamma=self._config.gamma,
+        )
+        self._newest = g
+        self.policy_steps += 1
+        return True
 
     def _policy(self) -> Table:
         return mix(np.exp(self._log_policy), self._config.table.epsilon)
@@ -65,7 +70,7 @@ class Npg(ForecastingQ):
     def state(self) -> State:
         """That of `ForecastingQ`, with how far the window's iterations are."""
         base = super().state()
-        return State(base.tensors, base.scalars | {"done": self._done})
+        return State(base.tensors, base.scalars | {"newest": self._newest})
 
     def load(self, state: State) -> None:
         """Go on from `state`.
@@ -74,7 +79,7 @@ class Npg(ForecastingQ):
             CheckpointError: it does not fit this configuration; nothing has changed then.
         """
         super().load(state)
-        self._done = int(state.scalars["done"])
+        self._newest = int(state.scalars["newest"])
 
     def _tables(self) -> dict[str, NDArray[Any]]:
         return super()._tables() | {"log_policy": self._log_policy}

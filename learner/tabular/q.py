@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.checkpoint import State, require_fit
+from learner.checkpoint import CheckpointError, State, require_fit
 from learner.replay import Columns, Replay
 from learner.tabular.table import Table, epsilon_greedy, q_update
 from rtcore.config import LearnerConfig
@@ -29,6 +29,7 @@ class QLearning:
         architecture: of the policy that `policy_arrays` gives.
         gradient_steps: transitions learned from so far.
         policy_steps: how many of them changed the policy while it was to be improved.
+        unread: transitions overwritten before they were read.
     """
 
     algo = "q"
@@ -39,12 +40,12 @@ class QLearning:
         self.architecture = table_architecture(spaces)
         self.gradient_steps = 0
         self.policy_steps = 0
+        self.unread = 0
         shape = (spaces.states, spaces.actions)
         self._q: Table = np.full(shape, config.table.initial, np.float64)
         self._visited = np.zeros(shape, np.bool_)
         self._learned_at = np.zeros(shape)  # mean time of the transitions in Q(s, a), weighted as Q has them
         self._next = 0  # number of the first transition not read yet
-        self._lost = 0  # overwritten before they were read
         self._invalid = 0  # of states or actions that there are not
         self._td_error = 0.0
         self._changed = False  # the policy, since the last `iterate`
@@ -58,11 +59,11 @@ class QLearning:
         """
         columns = self._replay.read(self._next, _MOST_AT_ONCE)
         oldest = self._replay.added - len(self._replay)
-        self._lost += max(0, oldest - self._next)
+        self.unread += max(0, oldest - self._next)
         self._next = max(oldest, self._next) + len(columns.reward)
         learned = self._learn(columns)
         self.gradient_steps += learned
-        if learned and self._acting() is self._q:
+        if learned and self._follows_q():
             self.policy_steps += learned if improve_policy else 0
             self._changed = True
 
@@ -95,6 +96,10 @@ class QLearning:
         if not self._visited[at]:
             self._visited[at], self._learned_at[at] = True, time
         self._learned_at[at] += self._config.table.step_size * (time - self._learned_at[at])
+
+    def _follows_q(self) -> bool:
+        """Whether what is learned moves the policy at once."""
+        return True
 
     def _acting(self) -> Table:
         """The Q that the policy is greedy in."""
@@ -130,7 +135,7 @@ class QLearning:
 
         loss/td_error: mean |delta| over the newest update's transitions; q_mean: mean Q(s, a) over what
         was ever visited; entropy: of the policy, mean over states, in nats; table/visited: share of (s, a)
-        ever visited; table/unread_lost: transitions overwritten before they were read; table/invalid: of
+        ever visited; table/unread: transitions overwritten before they were read; table/invalid: of
         states or actions that there are not.
         """
         return {
@@ -140,7 +145,7 @@ class QLearning:
             else self._config.table.initial,
             "entropy": entropy(self._policy()),
             "table/visited": float(self._visited.mean()),
-            "table/unread_lost": float(self._lost),
+            "table/unread": float(self.unread),
             "table/invalid": float(self._invalid),
         }
 
@@ -155,7 +160,7 @@ class QLearning:
             "gradient_steps": self.gradient_steps,
             "policy_steps": self.policy_steps,
             "next": self._next,
-            "lost": self._lost,
+            "unread": self.unread,
             "invalid": self._invalid,
             "td_error": self._td_error,
             "changed": self._changed,
@@ -169,12 +174,15 @@ class QLearning:
             CheckpointError: it does not fit this configuration; nothing has changed then.
         """
         require_fit(state, State(self._expected_tensors(state), self.state().scalars), same=SAME)
+        if state.scalars["next"] > self._replay.added:
+            read, there = state.scalars["next"], self._replay.added
+            raise CheckpointError(f"the checkpoint does not fit: it has read {read} transitions of {there}")
         for name, table in self._tables().items():
             table[...] = state.tensors[name]
         self.gradient_steps = int(state.scalars["gradient_steps"])
         self.policy_steps = int(state.scalars["policy_steps"])
         self._next = int(state.scalars["next"])
-        self._lost = int(state.scalars["lost"])
+        self.unread = int(state.scalars["unread"])
         self._invalid = int(state.scalars["invalid"])
         self._td_error = float(state.scalars["td_error"])
         self._changed = bool(state.scalars["changed"])

@@ -42,6 +42,7 @@ class Tempo:
         self.architecture = table_architecture(spaces)
         self.gradient_steps = 0
         self.policy_steps = 0
+        self.unread = 0  # nothing is learned
         self._begin, self._span = config.table.tempo_begin, config.table.tempo_span
         self._start = 0  # t_m
         self._beta = self._beta_in(0)

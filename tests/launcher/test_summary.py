@@ -134,6 +134,14 @@ def test_a_judged_forecast() -> None:
     }
 
 
+def test_what_never_reached_the_table_is_lost() -> None:
+    stats = whole_run()
+    (learner,) = stats[LEARNER]
+    learner.counters["unread"] = 7
+    plain, found = summary_of(whole_run())["transitions"], summary_of(stats)["transitions"]
+    assert (found["learned"], found["lost"]) == (plain["learned"] - 7, plain["lost"] + 7)
+
+
 def test_counts_that_do_not_reconcile_are_named() -> None:
     stats = whole_run()
     env = env_ledger()

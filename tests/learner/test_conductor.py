@@ -119,6 +119,17 @@ def test_an_operators_hold_stops_improving_and_resume_goes_on() -> None:
     assert conductor.advance(1950, LEAD_NS) == [PublishDue(window, 2)]
 
 
+def test_a_unit_that_an_operator_held_throughout_misses_nothing() -> None:
+    conductor = conductor_3_2()
+    window = Window(m=0, start=0, update=3, hold=2)
+    conductor.advance(200, LEAD_NS)
+    conductor.pause(300)
+    assert conductor.advance(2100, LEAD_NS) == [UnitEnded(0), PublishMissed(window, 1), UnitEnded(1)]
+    conductor.resume(2200)
+    conductor.pause(2300)
+    assert conductor.advance(3100, LEAD_NS) == [UnitEnded(2), PublishMissed(window, 3)]
+
+
 def test_a_resume_inside_a_scheduled_hold_stays_in_it() -> None:
     conductor = conductor_3_2()
     conductor.advance(200, LEAD_NS)

@@ -89,10 +89,10 @@ def test_no_field_takes_anything() -> None:
         ("env.count", 2, "must be 1"),
         ("env.start_wait_s", -0.1, "must be in [0, 1e9]"),
         ("env.drift.kind", "steps", None),
-        ("env.drift.offset", NAN, "must be in (-inf, inf)"),
-        ("env.drift.amplitude", INF, "must be in (-inf, inf)"),
-        ("env.drift.omega", -INF, "must be in (-inf, inf)"),
-        ("env.drift.phase", None, "must be in (-inf, inf)"),
+        ("env.drift.offset", NAN, "must be in [-1e12, 1e12]"),
+        ("env.drift.amplitude", INF, "must be in [-1e12, 1e12]"),
+        ("env.drift.omega", -INF, "must be in [-1e12, 1e12]"),
+        ("env.drift.phase", None, "must be in [-1e12, 1e12]"),
         ("env.reward.k_f", 0.0, "must be in (0, inf)"),
         ("env.reward.control_cost", -0.1, "must be in [0, inf)"),
         ("env.reward.healthy", NAN, "must be in (-inf, inf)"),
@@ -128,7 +128,8 @@ def test_no_field_takes_anything() -> None:
         ),
         ("learner.forecast.degree", 0, "must be an integer in 1..20"),
         ("learner.table.epsilon", 1.5, "must be in [0, 1]"),
-        ("env.drift.at", "soon", "must be in (-inf, inf), or 'random'"),
+        ("env.drift.omega", 1e308, "must be in [-1e12, 1e12]"),
+        ("env.drift.at", "soon", "must be in [-1e12, 1e12], or 'random'"),
         ("env.physics.gravity.rate", 0.0, "must be in (0, 1]"),
         ("learner.forecast.horizon", -1.0, "must be in [0, inf), or 'replay', or 'window'"),
         ("learner.forecast.shrink", -1.0, "must be in [0, inf)"),
@@ -231,6 +232,13 @@ def test_the_largest_policy_step_is_allowed_as_it_is_named() -> None:
         check(replaced(npg, "learner.table.eta", 0.101))
 
 
+def test_a_table_learns_in_a_hold_from_all_or_nothing() -> None:
+    q = replaced(RunConfig(), "learner.algo", "q")
+    check(replaced(q, "learner.hold_learning", "off"))
+    with pytest.raises(ConfigError, match=r"learner.hold_learning = 'half': must be 'full' or 'off' for q"):
+        check(replaced(q, "learner.hold_learning", "half"))
+
+
 def test_a_section_is_a_section() -> None:
     assert failure(("env", {"hz": 50})).startswith("env = {'hz': 50}: must be of type EnvConfig")
 
@@ -240,7 +248,7 @@ def test_intervals_are_what_they_say(low: float, value: float) -> None:
     assert RULES["learner.gamma"].holds(value) == (0 <= value <= 1)
     assert RULES["learner.tau"].holds(value) == (0 < value <= 1)
     assert RULES["learner.utd"].holds(low) == (0 < low < INF)
-    assert RULES["env.drift.phase"].holds(low) == (-INF < low < INF)
+    assert RULES["env.reward.healthy"].holds(low) == (-INF < low < INF)
 
 
 @pytest.mark.parametrize("name", ["env.drift", "env.physics.gravity"])

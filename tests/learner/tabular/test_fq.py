@@ -116,17 +116,31 @@ def test_trust_shrinks_the_forecast_towards_the_table() -> None:
     found, _ = lived(forecast={"trust": "judged"})
     found._forecaster._judge.hear(0.0, 1.0)  # perfect once: rho = 0.3
     found.begin_window(FIRST, 2)
-    assert forecast_of(found) == pytest.approx([1.1, 1.5])  # 0.3 * -1 + 0.7 * 2
-    assert found.state().tensors["forecast.judged"][0].tolist() == pytest.approx([-1.0, 1.5])
+    live = np.array([[2.0, 1.5]])
+    assert found._forecaster.trusted(live)[0].tolist() == pytest.approx([1.1, 1.5])  # 0.3 * -1 + 0.7 * 2
+    live[0, 0] = 4.0  # Q goes on
+    assert found._forecaster.trusted(live)[0].tolist() == pytest.approx([2.5, 1.5])
 
 
-def test_never_trusted_it_is_the_table_frozen_at_the_start() -> None:
+def test_partly_trusted_it_moves_with_q_within_the_window() -> None:
+    found, replay = lived(forecast={"trust": "judged"})
+    found._forecaster._judge.hear(0.0, 1.0)
+    found.begin_window(FIRST, 2)
+    assert acts(found) == [0.1, 0.9]  # 1.1 against 1.5
+    found.iterate(1)
+    pull(replay, 0, 4.0, unit=2)
+    found.update(improve_policy=True)
+    assert acts(found) == [0.9, 0.1]  # 2.5 against 1.5
+    assert found.iterate(2)
+
+
+def test_never_trusted_it_is_q_learning() -> None:
     found, replay = lived(forecast={"trust": "never"})
     found.begin_window(FIRST, 2)
     pull(replay, 0, 0.0, unit=2)
     found.update(improve_policy=True)
-    assert forecast_of(found) == [2.0, 1.5]
-    assert acts(found) == [0.9, 0.1]
+    assert acts(found) == [0.1, 0.9]  # 0 against 1.5
+    assert found.iterate(1)
 
 
 def test_a_window_cut_short_is_not_judged() -> None:

@@ -50,10 +50,10 @@ def test_what_the_ring_overwrote_is_counted() -> None:
     # 0.5 * 2 = 1; 1 + 0.5 * 3 = 2.5; 2.5 + 0.5 * 3.5 = 4.25
     assert q_of(found) == [[0.0, 4.25], [0.0, 4.0]]
     assert found.gradient_steps == 4
-    assert found.metrics()["table/unread_lost"] == 2
+    assert found.metrics()["table/unread"] == 2
     found.update(improve_policy=True)
     assert found.gradient_steps == 4
-    assert found.metrics()["table/unread_lost"] == 2
+    assert found.metrics()["table/unread"] == 2
 
 
 def test_a_long_queue_is_learned_in_several_calls() -> None:

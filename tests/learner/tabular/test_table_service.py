@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
+import msgspec
 import numpy as np
 import pytest
 
 from learner.algorithm import make_algorithm
+from learner.checkpoint import CheckpointError
 from learner.replay import Replay
 from learner.service import LearnerService
 from rtcore import channels
@@ -28,7 +32,7 @@ from rtcore.config import (
 )
 from rtcore.ledger import Ledger
 from rtcore.memory_bus import MemoryHub
-from rtcore.messages import Policy, Spec, Step, StepBatch
+from rtcore.messages import Command, Policy, Spec, Step, StepBatch
 from rtcore.run_dir import RunDir
 from rtcore.spaces import Spaces
 from rtcore.weights import verify
@@ -87,22 +91,27 @@ def step(seq: int) -> Step:
 class Rig:
     """A learner, its clock, and the other ends."""
 
-    def __init__(self, run_dir: RunDir, algo: Algo, **learner: object) -> None:
+    def __init__(self, run_dir: RunDir, algo: Algo, *, spec: Spec = SPEC, **learner: object) -> None:
+        self.tick_ns = spec.tick_ns
         hub, self.clock, self.ledger = MemoryHub(), VirtualClock(0), Ledger(channels.LEARNER, 1)
         env = hub.bus(channels.ENV_SERVER, self.clock)
         specs, self.log = env.publisher(channels.SPEC, "env0"), env.publisher(channels.LOG, "env0")
-        config = replace(CONFIG, learner=replace(CONFIG.learner, algo=algo, **learner))  # type: ignore[arg-type]
+        student = replace(CONFIG.learner, algo=algo, **learner)  # type: ignore[arg-type]
+        config = replace(CONFIG, env=replace(CONFIG.env, unit_s=spec.unit_ns / 1e9), learner=student)
         bus = hub.bus(channels.LEARNER, self.clock)
         self.learner = LearnerService(config, run_dir, bus, self.clock, self.ledger)
         self.policies = hub.bus(channels.AGENT, self.clock).queue(channels.POLICY)
-        specs.put(SPEC)
+        specs.put(spec)
 
     def live(self, first: int, last: int) -> None:
         """Ticks first..last, one batch each, the learner catching up in between."""
         for seq in range(first, last + 1):
-            self.clock.sleep_until_ns(seq * TICK_NS)
+            self.clock.sleep_until_ns(seq * self.tick_ns)
             self.log.put(StepBatch(steps=[step(seq)]))
             self.learner.catch_up()
+
+    def order(self, verb: Literal["hold", "resume"]) -> None:
+        self.learner.command(Command(id=verb, verb=verb))
 
     def published(self) -> list[Policy]:
         return [received.message for received in self.policies.drain()]
@@ -190,6 +199,44 @@ def test_a_learner_that_comes_back_learns_nothing_twice(run_dir: RunDir) -> None
     np.testing.assert_allclose(algorithm.state().tensors["q"], plain_q(59))
 
 
+def test_an_operators_hold_stops_the_policy_gradient(run_dir: RunDir) -> None:
+    rig = Rig(run_dir, "npg", schedule=ScheduleConfig(l_f=6, gamma_f=1.0))
+    rig.live(0, 12)
+    rig.order("hold")
+    rig.live(13, 42)
+    assert (rig.ledger.counter("policy_steps"), len(rig.published())) == (1, 1)
+    rig.order("resume")
+    rig.live(43, 49)
+    assert [policy.iterate for policy in rig.published()] == [5]
+    assert rig.ledger.counter("policy_steps") == 2
+    assert rig.ledger.counter("withheld") == 0
+
+
+def test_what_was_overwritten_before_it_was_read_is_counted(run_dir: RunDir) -> None:
+    rig = Rig(run_dir, "q", hold_learning="off", replay_capacity=16)
+    rig.live(0, 40)
+    # tick 20 and on wait for window 1: 21 transitions, of which the ring holds 16
+    assert rig.ledger.counter("unread") == 5
+    assert rig.ledger.counter("gradient_steps") == 19 + 16
+
+
+def test_a_checkpoint_without_its_replay_is_refused(run_dir: RunDir) -> None:
+    rig = Rig(run_dir, "q")
+    rig.live(0, 19)
+    rig.learner.close()
+    shutil.rmtree(run_dir.learner_dir / "replay")
+    second = Rig(run_dir, "q")
+    with pytest.raises(CheckpointError, match="it has read 19 transitions of 0"):
+        second.live(20, 21)
+
+
+def test_iterates_come_shortly_before_short_units_end(run_dir: RunDir) -> None:
+    rig = Rig(run_dir, "q", spec=msgspec.structs.replace(SPEC, tick_ns=5_000_000, unit_ns=100_000_000))
+    rig.live(0, 19)
+    # a quarter of the unit is 25 ms: with ticks of 5 ms, tick 15
+    assert [policy.created_ns // rig.tick_ns for policy in rig.published()] == [15]
+
+
 @pytest.mark.parametrize("algo", ["sac", "fsac", "rsac"])
 def test_networks_are_refused_in_a_finite_world(algo: Algo) -> None:
     run = replace(CONFIG, learner=replace(CONFIG.learner, algo=algo))
@@ -211,6 +258,7 @@ def test_a_learner_of_tables_does_not_load_torch() -> None:
 import sys
 import learner.__main__
 from learner.algorithm import make_algorithm, prepare
+from learner.checkpoint import CheckpointError
 from learner.replay import Replay
 from rtcore.config import LearnerConfig, RunConfig
 from rtcore.spaces import Spaces
