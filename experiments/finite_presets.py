@@ -26,14 +26,14 @@ def cliffworld() -> RunConfig:
     """The paper's cliffworld at 200 Hz: after a minute the goal moves to the other corner.
 
     Learned within two minutes by future Q, whose forecast is trusted as far as it has proved right. Mean
-    reward per step in virtual time, seeds 0 and 1, before the goal moves (42 to 60 s), some time after it
+    reward per step in virtual time, seeds 0 to 2, before the goal moves (42 to 60 s), some time after it
     (78 to 102 s) and in the end (102 to 120 s):
 
-        fq as here                               3.0   1.7   3.1
-        fq, trusted always                       3.0  -0.5   3.1
-        fq, trusted always, windows of 5 units   0.7  -2.5   0.5
-        q                                        3.1   3.0   3.4
-        q, gamma 0.99                            3.1  -2.0   2.5
+        fq as here                               3.2   1.8   3.6
+        fq, trusted always                       3.1   2.0   3.0
+        fq, trusted always, windows of 5 units   0.6   1.9   2.7
+        q                                        3.2   2.9   3.6
+        q, gamma 0.99                            3.2  -0.7   3.6
 
     So the forecast gains nothing here. With a gamma near 1 the old goal, which still ends the episode, is
     unlearned late.
@@ -94,7 +94,7 @@ def cliffworld_as_published() -> RunConfig:
 def bandit() -> RunConfig:
     """The paper's motivating example (section 1): two arms that swap their rewards at an unknown time.
 
-    Mean reward per step over two minutes in virtual time, seeds 0 to 5: q 0.94, npg 0.92, where 0.95 is the
+    Mean reward per step over two minutes in virtual time, seeds 0 to 5: q and fq 0.94, npg 0.92, where 0.95 is the
     most that a tenth of random choices leaves; `bandit_conservative` 0.58 and `bandit_pessimistic` 0.65.
     """
     return RunConfig(
@@ -141,7 +141,7 @@ def random_mdp() -> RunConfig:
             drift=DriftConfig(kind="sine", offset=0.5, amplitude=0.5, omega=2 * math.pi / 160),
             mdp=MdpConfig(states=6, actions=3, concentration=0.3, drifting="reward"),
         ),
-        # Mean reward per step after the first 36 s, seed 0: 0.66, against 0.58 with epsilon 0.5.
+        # Mean reward per step after the first 36 s, seeds 0 to 2: 0.71, against 0.64 with epsilon 0.5.
         learner=_algorithm_1(epsilon=0.2),
     )
 
