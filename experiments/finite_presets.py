@@ -94,8 +94,8 @@ def cliffworld_as_published() -> RunConfig:
 def bandit() -> RunConfig:
     """The paper's motivating example (section 1): two arms that swap their rewards at an unknown time.
 
-    Mean reward per step over two minutes in virtual time, seeds 0 to 5: q and fq 0.94, npg 0.92, where 0.95 is the
-    most that a tenth of random choices leaves; `bandit_conservative` 0.58 and `bandit_pessimistic` 0.65.
+    Mean reward per step over two minutes in virtual time, seeds 0 to 5: q and fq 0.94, npg 0.92, where 0.95
+    is the most that a tenth of random choices leaves; `bandit_conservative` 0.58, `bandit_pessimistic` 0.65.
     """
     return RunConfig(
         preset="bandit",

@@ -53,7 +53,8 @@ def fit(config: ForecastConfig, time_k: Sequence[float], query: float) -> Floats
     kept = size > _RANK * max(1.0, float(np.abs(time).max()))
     gain = size[kept] / (size[kept] ** 2 + config.shrink)
     change: Floats = right[kept].T @ (gain * (left[:, kept].T @ columns[:, -1]))
-    return average + (change - change.mean())  # the sum stays 1 where the fit is so bad that rounding shows
+    change -= change.mean()  # so that the sum stays 1 where the fit is so bad that rounding shows
+    return average + change
 
 
 def horizon(config: ForecastConfig, window: Window, age_units: float) -> float:
