@@ -58,6 +58,11 @@ COMMANDS = (
         "launcher.doctor.command:doctor",
         "what this machine lacks for real time, and how to grant it",
     ),
+    Command(
+        "plan",
+        "launcher.plan.command:plan",
+        "how long to update and to hold, by the paper's bound",
+    ),
     Command("report", "launcher.report:report", "a run's report again"),
     Command("view", "launcher.view:view", "open a run's recording in Rerun"),
 )
