@@ -1,4 +1,4 @@
-"""What every world keeps to, and what each one alone promises."""
+"""What every world keeps to, and what the reward of the simulated ones is."""
 
 from __future__ import annotations
 
@@ -12,42 +12,14 @@ import pytest
 
 from env_server.wording import word_spec
 from env_server.worlds.drift import make_drift
-from env_server.worlds.pointmass import PointMass
 from env_server.worlds.registry import make_world
 from env_server.worlds.world import Outcome, Vector, World
-from rtcore.config import DriftConfig, EnvConfig, MdpConfig, Notify, PhysicsConfig, RewardConfig
+from rtcore.config import DriftConfig, EnvConfig, Notify, PhysicsConfig, RewardConfig
 from rtcore.messages import Step
+from tests.env_server.every_world import NONE, SINE, WORLDS
 from tests.env_server.rig import Rig, run_config
 from tests.env_server.scripted import ScriptedAgent
 
-SINE = DriftConfig(kind="sine", offset=0.5, amplitude=1.0, omega=0.3)
-WEIGHT = DriftConfig(kind="sine", offset=0.5, amplitude=0.5, omega=0.3)
-PHYSICS = PhysicsConfig(
-    mass=DriftConfig(kind="sine", offset=1.0, amplitude=0.4, omega=0.3),
-    friction=DriftConfig(kind="switch", offset=1.0, amplitude=-0.5, at=3, every=4),
-    gravity=DriftConfig(kind="ou", offset=1.0, sd=0.1),
-)
-NONE = DriftConfig(kind="none")
-WORLDS = {
-    "halfcheetah": EnvConfig(drift=SINE),
-    "halfcheetah_at_one_physics_step": EnvConfig(drift=SINE, hz=200.0, speed=2.0),
-    "halfcheetah_plain": EnvConfig(drift=NONE, hz=100.0, speed=3.0),
-    "swimmer": EnvConfig(id="Swimmer-v5", drift=SINE, reward=RewardConfig(control_cost=1e-4)),
-    "pointmass": EnvConfig(id="pointmass", drift=SINE),
-    "pointmass_twice": EnvConfig(id="pointmass", drift=SINE, hz=10.0, speed=1.0),
-    "pendulum": EnvConfig(id="Pendulum-v1", drift=NONE),
-    "hopper": EnvConfig(id="Hopper-v5", drift=NONE),  # one that terminates
-    "halfcheetah_walk": EnvConfig(drift=DriftConfig(kind="random_walk", sd=0.3)),
-    "halfcheetah_physics": EnvConfig(drift=SINE, physics=PHYSICS),
-    "hopper_physics": EnvConfig(id="Hopper-v5", drift=NONE, physics=PHYSICS),
-    "pointmass_physics": EnvConfig(
-        id="pointmass", drift=SINE, physics=PhysicsConfig(mass=PHYSICS.mass, friction=PHYSICS.friction)
-    ),
-    "cliffworld": EnvConfig(id="cliffworld", hz=10.0, drift=DriftConfig(kind="switch", amplitude=1.0, at=6)),
-    "bandit": EnvConfig(id="bandit", hz=10.0, drift=WEIGHT),
-    "random_mdp": EnvConfig(id="random_mdp", hz=10.0, drift=WEIGHT, mdp=MdpConfig(drifting="both")),
-    "chain": EnvConfig(id="chain", hz=10.0, drift=WEIGHT, mdp=MdpConfig(slip=0.2)),
-}
 STEPS = 30
 # Something of them is drawn from the run's seed, once: the others are the same in every run.
 DRAWN = [WORLDS[name] for name in ("halfcheetah_walk", "halfcheetah_physics", "hopper_physics", "random_mdp")]
@@ -302,41 +274,3 @@ def test_without_drift_a_walker_keeps_gymnasiums_reward() -> None:
         assert ours.step(action, 0).reward == pytest.approx(float(theirs.step(action)[1]))
     ours.close()
     theirs.close()
-
-
-def test_pointmass_by_hand() -> None:
-    drift = DriftConfig(kind="constant", offset=1.0)
-    world = PointMass(drift, RewardConfig(control_cost=0.01), seed=0)
-    noise = np.random.default_rng(11)
-    speed = noise.uniform(-0.1, 0.1)
-    assert world.reset(11, 0) == pytest.approx([speed])
-    position = 0.0
-    for action in (1.0, -0.5):
-        speed = 0.8 * speed + 0.5 * action + 0.05 * noise.standard_normal()
-        position += 0.05 * speed
-        outcome = world.step(np.array([action], np.float32), 0)
-        assert outcome.observation == pytest.approx([speed])
-        assert outcome.reward == pytest.approx(-abs(speed - 1.0) - 0.01 * action**2)
-        assert world.position() == pytest.approx([position])
-
-
-def test_pointmass_settles_where_the_equation_says() -> None:
-    # v = 0.8 v + 0.5 a has the fixed point 2.5 a; noise of sd 0.05 / sqrt(1 - 0.64) = 0.083
-    world = PointMass(NONE, RewardConfig(), seed=0)
-    world.reset(0, 0)
-    speeds = [float(world.step(np.array([0.4], np.float32), 0).observation[0]) for _ in range(2000)]
-    assert np.mean(speeds[100:]) == pytest.approx(1.0, abs=0.03)
-    assert np.std(speeds[100:]) == pytest.approx(0.0833, abs=0.01)
-
-
-def test_pointmass_with_two_periods_per_tick_is_the_one_period_world_twice() -> None:
-    one = PointMass(SINE, RewardConfig(control_cost=0.0), seed=0)
-    two = PointMass(SINE, RewardConfig(control_cost=0.0), seed=0, steps=2)
-    one.reset(3, 0)
-    two.reset(3, 0)
-    action = np.array([0.7], np.float32)
-    speeds = [one.step(action, 6).observation[0] for _ in range(2)]
-    outcome = two.step(action, 6)
-    assert outcome.observation[0] == speeds[1]
-    assert two.position() == pytest.approx(one.position())
-    assert outcome.reward == pytest.approx(-abs((speeds[0] + speeds[1]) / 2 - make_drift(SINE, 0).value(6)))

@@ -24,7 +24,7 @@ from launcher.doctor.findings import CONTAINER, HAND_DOWN, Finding, findings, ve
 from launcher.echo.measure import EchoResult
 from rtcore.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, FIFO, GRANTS, MEMORY, PINNING, SLACK, Privileges
 from tests.launcher.commands import command_line, tenuto
-from tests.launcher.test_latency import ECHO
+from tests.launcher.latency_results import ECHO
 
 GOOD = Facts(
     probed=Probed("SCHED_FIFO 50", memory_locked=True, timer_slack_ns=1, missing=()),
