@@ -12,7 +12,7 @@ import pytest
 from experiments.intervals import Interval
 from experiments.rsac import METHODS, collect, compared, differences, held, table
 from experiments.rsac_picture import draw
-from experiments.rsac_runs import DRIFTS, Job, Results, configure, run, score
+from experiments.rsac_runs import DRIFTS, UNITS, Job, Results, configure, run, score
 from experiments.rsac_tuning import FINALISTS, MODELS, SEEDS, Model, grid, tune
 from rtcore.config_check import check
 
@@ -67,7 +67,7 @@ def test_sac_is_chosen_among_its_finalists_on_every_seed() -> None:
     results = Made()
     chosen = tune(results, 1)
     assert set(chosen) == {(drift, model) for drift in DRIFTS for model in MODELS}
-    # Finalists 0.2 and 0.1; over three seeds, 0.2 - 2 * 0.2 is worse than 0.1 - 2 * 0.1.
+    # Finalists 0.2 and some with 0.1; over three seeds, 0.2 - 2 * 0.2 is worse than 0.1 - 2 * 0.1.
     assert chosen["fast", ""].alpha == 0.1
     assert chosen["fast", "declared"].alpha == 0.1  # by its one seed
     again = [job for job in results.ran if job.seed != SEEDS[0]]
@@ -77,7 +77,7 @@ def test_sac_is_chosen_among_its_finalists_on_every_seed() -> None:
 
 def test_the_methods_differ_in_what_they_should() -> None:
     chosen = {
-        (drift, model): Job(drift=drift, model=model, alpha=0.02, seed=100)
+        (drift, model): Job(drift=drift, model=model, alpha=0.02, seed=100, units=120)
         for drift in DRIFTS
         for model in MODELS
     }
@@ -86,7 +86,7 @@ def test_the_methods_differ_in_what_they_should() -> None:
     alone, forecast = jobs["fast", "learned, relabelled"], jobs["fast", "learned, forecast"]
     assert (alone.forecast, forecast.forecast) == ("persistence", "best")
     assert replace(alone, forecast="best") == forecast
-    assert {job.seed for job in jobs.values()} == {7}
+    assert {(job.seed, job.units) for job in jobs.values()} == {(7, UNITS)}
     assert {job.hold for job in held(chosen, 7).values()} == {4}
 
 
