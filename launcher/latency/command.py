@@ -27,6 +27,7 @@ from launcher.latency.table import ECHOES, LOADS, cell_table, overview, remarks
 from launcher.latency.trial import Load, Trial, trial_config
 from launcher.latency.trial_run import TrialError, run_trial
 from launcher.machine import machine
+from launcher.out_dir import make_out_dir
 from launcher.parsing import parse
 from launcher.run import RUNS
 from rtcore.config import ConfigError, RunConfig
@@ -82,7 +83,7 @@ def latency(argv: Sequence[str]) -> int:
     options = parse(LatencyOptions, argv, prog="tenuto latency", description=str(LatencyOptions.__doc__))
     planned = plan(options)
     out = options.out or default_run_path(RUNS, "latency", datetime.now(UTC))
-    made = _make(out)
+    made = make_out_dir(out)
     console = Console()
     results = Results(
         at=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -230,18 +231,6 @@ def _finish(results: Results, out: Path, console: Console) -> None:
 
         draw(results, out / "latency.png")
         console.print(f"picture  {out / 'latency.png'}", highlight=False, soft_wrap=True)
-
-
-def _make(out: Path) -> list[Path]:
-    """Make the directory; returns what was made, the deepest first."""
-    made = [path for path in (out, *out.parents) if not path.exists()]
-    try:
-        out.mkdir(parents=True)
-    except FileExistsError as error:
-        raise ConfigError("out", str(out), "must not exist yet") from error
-    except OSError as error:
-        raise ConfigError("out", str(out), f"must be a path to write to ({error.strerror})") from error
-    return made
 
 
 @contextmanager

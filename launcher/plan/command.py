@@ -13,6 +13,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from launcher.cli import DONE
+from launcher.out_dir import make_out_dir
 from launcher.parsing import parse
 from launcher.plan.constants import NAMES, Number, Plan, check_window, read_constants, settle
 from launcher.plan.results import CAVEAT, as_json, render
@@ -63,7 +64,9 @@ def plan(argv: Sequence[str]) -> int:
     if options.figures:
         return _figures(options, flags, console)
     planned = _planned(options, flags)
-    out = None if options.out is None else _make(options.out)
+    out = options.out
+    if out is not None:
+        make_out_dir(out)
     console.print(render(planned), highlight=False)
     if out is not None:
         from launcher.plan.picture import draw_plan  # most of a second, that a printed plan need not wait for
@@ -93,7 +96,8 @@ def _figures(options: PlanOptions, flags: dict[str, Number], console: Console) -
     from launcher.plan.picture import draw_panels
 
     drawn = panels()
-    out = _make(options.out or default_run_path(RUNS, "plan", datetime.now(UTC)))
+    out = options.out or default_run_path(RUNS, "plan", datetime.now(UTC))
+    make_out_dir(out)
     for panel in drawn:
         minima = ", ".join(f"{curve.label} at {curve.best.hold}" for curve in panel.curves)
         console.print(f"{panel.name:>10}  least N: {minima}", highlight=False)
@@ -107,13 +111,3 @@ def _figures(options: PlanOptions, flags: dict[str, Number], console: Console) -
 def _write(out: Path, data: dict[str, Any], console: Console) -> None:
     write_atomic(out / DATA, (json.dumps(data, indent=2) + "\n").encode())
     console.print(f"results  {out / DATA}", highlight=False, soft_wrap=True)
-
-
-def _make(out: Path) -> Path:
-    try:
-        out.mkdir(parents=True)
-    except FileExistsError as error:
-        raise ConfigError("out", str(out), "must not exist yet") from error
-    except OSError as error:
-        raise ConfigError("out", str(out), f"must be a path to write to ({error.strerror})") from error
-    return out
