@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from env_server.worlds.world import Outcome, Position, Vector
 
 
-class FiniteWorld:
+class FiniteWorld(ABC):
     """A world whose observation is the state's number and whose action is the action's, one float32 each.
 
     An action between two numbers counts as the nearer one, and one outside as the nearest: 1.4 is action 1.
@@ -34,13 +35,13 @@ class FiniteWorld:
         self.random = np.random.default_rng(seed)
         self.state = 0
 
+    @abstractmethod
     def start(self, drift: float) -> int:
-        """The state that an episode begins in, given the drift's value. For subclasses."""
-        raise NotImplementedError
+        """The state that an episode begins in, given the drift's value."""
 
+    @abstractmethod
     def transition(self, state: int, action: int, drift: float) -> tuple[int, float, bool]:
-        """(next state, reward, terminated) of one step, given the drift's value over it. For subclasses."""
-        raise NotImplementedError
+        """(next state, reward, terminated) of one step, given the drift's value over it."""
 
     def reset(self, seed: int | None, t: int, /) -> Vector:
         """Begin an episode in unit `t`."""
@@ -64,10 +65,10 @@ class FiniteWorld:
         """Nothing to draw."""
         return np.zeros(0)
 
-    def save_scene(self, _path: Path, /) -> None:
+    def save_scene(self, _path: Path, /) -> None:  # noqa: B027 (few have one)
         """No file is needed to draw it."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 (plain arrays)
         """Nothing to free."""
 
     def _observe(self) -> Vector:
