@@ -19,7 +19,8 @@ from launcher.plan.constants import NAMES, Number, Plan, check_window, read_cons
 from launcher.plan.results import CAVEAT, as_json, render
 from launcher.run import RUNS
 from rtcore.config import ConfigError
-from rtcore.run_dir import default_run_path, write_atomic
+from rtcore.files import write_atomic
+from rtcore.run_dir import default_run_path
 
 DATA, PICTURE = "plan.json", "plan.png"
 

@@ -88,7 +88,7 @@ def settle(
     """One value for each constant: the flag's, else the file's, else the run's, else a neutral one.
 
     Raises:
-        ConfigError: a constant is missing or out of its range.
+        ConfigError: a constant is missing or out of its range, or an alpha is not above 1 where a B is.
     """
     values: dict[str, Number] = {}
     origins: dict[str, str] = {}
@@ -107,6 +107,11 @@ def settle(
             raise ConfigError(name, None, "must be given: by a flag, in --config, or through a RUN")
     window = check_window(values.pop("window"))
     problem = HoldProblem(window=window, **{name: float(value) for name, value in values.items()})
+    for alpha, scale in (("alpha_1", "b_1"), ("alpha_2", "b_2")):
+        if values[scale] and not values[alpha] > 1:
+            raise ConfigError(
+                alpha, values[alpha], f"must be above 1 with a {scale} above 0, by Assumption 1"
+            )
     if run is None:
         return Plan(problem, origins)
     return Plan(problem, origins, run.unit_s, run.remarks, run.envelopes)

@@ -18,6 +18,7 @@ from learner.theory.optimum import (
     Split,
     best_environment_split,
     best_policy_split,
+    best_settled_split,
     best_split,
     environment_regret,
     policy_regret,
@@ -50,6 +51,7 @@ def as_json(plan: Plan) -> dict[str, Any]:
         "constants": {name: {"value": getattr(problem, name), "from": plan.origins[name]} for name in NAMES},
         "unit_s": plan.unit_s,
         "best": _split_json(best_split(problem)),
+        "settled": _split_json(best_settled_split(problem)),
         "policy_term_alone": _split_json(best_policy_split(problem)),
         "environment_term_alone": _split_json(best_environment_split(problem)),
         "calculus": calculus(problem),
@@ -71,7 +73,7 @@ def terms(problem: HoldProblem) -> list[tuple[int, int, float, float, float]]:
 
 def calculus(problem: HoldProblem) -> dict[str, float | int | None] | None:
     """The paper's closed form and equation, corrected and as printed; None where they do not apply, because
-    an alpha is not above 1 or a B is 0. The printed closed form is None where the alphas are equal.
+    a B is 0 or an alpha is not above 1. The printed closed form is None where the alphas are equal.
     """
     if min(problem.alpha_1, problem.alpha_2) <= 1 or min(problem.b_1, problem.b_2) <= 0:
         return None
@@ -117,12 +119,13 @@ def _answer(plan: Plan) -> Table:
             ),
         ),
         *_use(plan, best),
+        ("repaired", f"{_told(best_settled_split(problem))}, with (1 - x)^(G - 1) in R^pi"),
         ("R^pi alone", _told(best_policy_split(problem))),
         ("R^env alone", _told(best_environment_split(problem))),
     ]
     found = calculus(problem)
     if found is None:
-        rows.append(("by calculus", "not with an alpha of at most 1 or a B of 0"))
+        rows.append(("by calculus", "not with a B of 0"))
     else:
         printed = found["environment_hold_printed"]
         rows.append((

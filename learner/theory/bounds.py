@@ -148,6 +148,7 @@ def update_bound(found: Constants, c1: float, delta: float, budget: Budget, upda
         budget: of [t_m, t_m + G); printed `budgets.cumulative`, repaired `budgets.cumulative_right`.
         update: G >= 0.
     """
+    _check_units("update", update, 0)
     left = (1.0 - found.x) ** update
     return Terms(c1 * (1.0 - left) / found.x, _forecast(found, delta, update), _environment(found, budget))
 
@@ -163,6 +164,8 @@ def hold_bound(found: Constants, c1: float, delta: float, budget: Budget, update
         update: G >= 0.
         hold: N >= 0.
     """
+    _check_units("update", update, 0)
+    _check_units("hold", hold, 0)
     left = (1.0 - found.x) ** update
     return Terms(hold * c1 * left, _forecast(found, delta, hold), _environment(found, budget))
 
@@ -172,6 +175,8 @@ def theorem1(found: Constants, c1: float, delta: float, budget: Budget, update: 
 
     `budget` is the sum over both phases. With one C_1 and one delta this is Lemma 1 plus Lemma 2.
     """
+    _check_units("update", update, 0)
+    _check_units("hold", hold, 0)
     once = c1 / found.x
     policy = once + (hold * c1 - once) * (1.0 - found.x) ** update
     return Terms(policy, _forecast(found, delta, update + hold), _environment(found, budget))
@@ -185,6 +190,7 @@ def settled_update_bound(
     C_0 = ||Q*_tau - Q_tau|| + tau ||log pi*_tau - log pi_{t_m}|| bounds what pi^0 itself loses to V*_tau, and
     C_1 (1 - x)^(g-1) what pi^g does. All else is as in `update_bound`.
     """
+    _check_units("update", update, 1)
     after = update_bound(found, c1, delta, budget, update - 1)
     c0 = start.value + tau * start.log_policy
     return after._replace(policy=c0 + after.policy, forecast=_forecast(found, delta, update))
@@ -194,6 +200,7 @@ def settled_hold_bound(
     found: Constants, c1: float, delta: float, budget: Budget, update: int, hold: int
 ) -> Terms:
     """Lemma 2 likewise: R^pi = N C_1 (1 - x)^(G-1), G >= 1."""
+    _check_units("update", update, 1)
     return hold_bound(found, c1, delta, budget, update - 1, hold)
 
 
@@ -251,7 +258,14 @@ def gibbs_bound(
     return bound
 
 
+def _check_units(name: str, units: int, least: int) -> None:
+    if units < least:
+        raise ConfigError(name, units, f"must be >= {least}: units of a phase")
+
+
 def _forecast(found: Constants, delta: float, units: int) -> float:
+    if not delta >= 0:
+        raise ConfigError("delta", delta, "must be >= 0")
     return units * (found.c2 * delta + found.c3)
 
 

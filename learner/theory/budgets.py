@@ -37,9 +37,9 @@ def local(changes: Floats, begin: int, end: int) -> float:
     """B(t1, t2) = sum_{t=t1}^{t2-1} b[t]; 0 for t1 = t2.
 
     Raises:
-        ConfigError: not 0 <= t1 <= t2 <= len(b).
+        ConfigError: not 0 <= t1 <= t2 <= len(b), or `changes` are not [T - 1] numbers >= 0.
     """
-    _check(begin, end, len(changes))
+    _check(changes, begin, end, beyond=0)
     return float(changes[begin:end].sum())
 
 
@@ -49,9 +49,9 @@ def cumulative(changes: Floats, begin: int, end: int) -> float:
     The change b[t2-1] at the window's end is in no term.
 
     Raises:
-        ConfigError: not 0 <= t1 <= t2 <= len(b) + 1.
+        ConfigError: not 0 <= t1 <= t2 <= len(b) + 1, or `changes` as in `local`.
     """
-    _check(begin, end, len(changes) + 1)
+    _check(changes, begin, end, beyond=1)
     inside = changes[begin : max(begin, end - 1)]
     return float((inside * np.arange(len(inside), 0, -1)).sum())
 
@@ -63,13 +63,18 @@ def cumulative_right(changes: Floats, begin: int, end: int) -> float:
     sums; its statement has Bbar(t1, t2) instead, which is less when changes come late in the phase.
 
     Raises:
-        ConfigError: not 0 <= t1 <= t2 <= len(b) + 1.
+        ConfigError: not 0 <= t1 <= t2 <= len(b) + 1, or `changes` as in `local`.
     """
-    _check(begin, end, len(changes) + 1)
+    _check(changes, begin, end, beyond=1)
     inside = changes[begin : max(begin, end - 1)]
     return float((inside * np.arange(1, len(inside) + 1)).sum())
 
 
-def _check(begin: int, end: int, limit: int) -> None:
+def _check(changes: Floats, begin: int, end: int, *, beyond: int) -> None:
+    if np.ndim(changes) != 1:
+        raise ConfigError("changes.shape", np.shape(changes), "must be [T - 1]")
+    if not (np.asarray(changes) >= 0).all():
+        raise ConfigError("changes", np.asarray(changes).tolist(), "must be >= 0")
+    limit = len(changes) + beyond
     if not 0 <= begin <= end <= limit:
         raise ConfigError("interval", (begin, end), f"must have 0 <= begin <= end <= {limit}")

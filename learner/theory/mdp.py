@@ -43,7 +43,7 @@ class TimeElapsingMdp:
         expected = (*reward.shape, reward.shape[1])
         if transition.shape != expected:
             raise ConfigError("transition.shape", transition.shape, f"must be [T, S, A, S] = {expected}")
-        _check_distributions("transition", transition)
+        check_distributions("transition", transition)
         check_discount(self.gamma, self.horizon)
         object.__setattr__(self, "reward", reward)
         object.__setattr__(self, "transition", transition)
@@ -103,7 +103,7 @@ def check_discount(gamma: float, horizon: int | None) -> None:
     """
     if not 0.0 <= gamma < 1.0:
         raise ConfigError("gamma", gamma, "must be in [0, 1)")
-    if horizon is not None and (horizon < 1 or horizon != int(horizon)):
+    if horizon is not None and not (horizon >= 1 and float(horizon).is_integer()):
         raise ConfigError("horizon", horizon, "must be a whole number >= 1, or None for no end")
 
 
@@ -116,12 +116,27 @@ def check_policies(name: str, policy: Floats, shape: tuple[int, ...]) -> Floats:
     policy = np.asarray(policy, np.float64)
     if policy.shape != shape:
         raise ConfigError(f"{name}.shape", policy.shape, f"must be {shape}")
-    _check_distributions(name, policy)
+    check_distributions(name, policy)
     return policy
 
 
+def check_distributions(name: str, rows: Floats) -> None:
+    """Refuse rows [..., n] that are no distributions, and name the first of them.
+
+    Raises:
+        ConfigError: a row with a negative number or NaN, or whose sum is not 1.
+    """
+    bad = ~((rows >= 0).all(-1) & (np.abs(rows.sum(-1) - 1.0) <= _STOCHASTIC))
+    if bad.any():
+        where = _first(bad)
+        raise ConfigError(f"{name}{list(where)}", rows[where].tolist(), "must be >= 0 and sum to 1")
+
+
 def _frozen(name: str, value: Any, axes: int) -> Floats:
-    array: Floats = np.array(value, np.float64)
+    try:
+        array: Floats = np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(name, value, f"must be an array of numbers with {axes} axes") from error
     if array.ndim != axes or not array.size:
         raise ConfigError(f"{name}.shape", array.shape, f"must have {axes} axes, none of them empty")
     if not np.isfinite(array).all():
@@ -129,13 +144,6 @@ def _frozen(name: str, value: Any, axes: int) -> Floats:
         raise ConfigError(f"{name}{list(where)}", float(array[where]), "must be finite")
     array.flags.writeable = False
     return array
-
-
-def _check_distributions(name: str, rows: Floats) -> None:
-    bad = ~((rows >= 0).all(-1) & (np.abs(rows.sum(-1) - 1.0) <= _STOCHASTIC))
-    if bad.any():
-        where = _first(bad)
-        raise ConfigError(f"{name}{list(where)}", rows[where].tolist(), "must be >= 0 and sum to 1")
 
 
 def _first(flags: NDArray[np.bool_]) -> tuple[int, ...]:

@@ -5,7 +5,8 @@ With G = W - N, x = eta tau and geo(a, n) = (a^n - 1) / (a - 1), the paper's sec
     R^pi(N)  = C_1 (1 - (1 - x)^G) / x + N C_1 (1 - x)^G                     (Theorem 1)
     R^env(N) = (C_4 + C_5) (B_1 geo(alpha_1, G) + B_2 geo(alpha_2, N))       (its f_2, Assumption 1)
 
-The third, R^f = (N + G) (C_2 delta + C_3), is the same for every N. Both terms have exact differences,
+The third, R^f = (N + G) (C_2 delta + C_3), is as printed the same for every N. Both terms have exact
+differences,
 
     R^pi(N + 1) - R^pi(N)   = C_1 N x (1 - x)^(G - 1)
     R^env(N + 1) - R^env(N) = (C_4 + C_5) (B_2 alpha_2^N - B_1 alpha_1^(G - 1))
@@ -13,6 +14,16 @@ The third, R^f = (N + G) (C_2 delta + C_3), is the same for every N. Both terms 
 which never fall with N while both alphas are at least 1: the sum is discretely convex, and the least N with
 a difference of at least 0 is the minimum. No calculus is needed, nor does the convexity in real N that the
 paper claims hold everywhere. Its closed form and its equation are in `learner.theory.stationarity`.
+
+This is the paper's problem, of Theorem 1 as printed. Of what `learner.theory.bounds` mends in it
+
+- a is in C_5, which is a number here;
+- b leaves R^env as it is: Assumption 1 is of any interval, so the same envelope bounds either anchor's sum;
+- e, the exponent G - 1, divides C_1 by 1 - x in the differences. `best_settled_split` has it: the hold is
+  the same or one unit shorter, because each of its differences is at most the next one here;
+- c makes R^f depend on N, which no constant here tells. With the error at an anchor bounded by delta^f and
+  the budget from there to t_{m+1}, R^f + R^env is least at N = 0 whatever changes: what a hold takes out of
+  R^env, weighed by C_4 = 2 h, comes at least as often in R^f, weighed by C_2 h, and C_2 >= 4.
 """
 
 from __future__ import annotations
@@ -62,8 +73,8 @@ class HoldProblem:
     b_2: float
 
     def __post_init__(self) -> None:
-        if self.window < 1:
-            raise ConfigError("window", self.window, "must be at least 1: W in units")
+        if not (self.window >= 1 and float(self.window).is_integer()):
+            raise ConfigError("window", self.window, "must be a whole number, at least 1: W in units")
         for name in (*_AT_LEAST_0, *_ABOVE_0):
             value = getattr(self, name)
             if not (0 < value <= MOST or (value == 0 and name in _AT_LEAST_0)):
@@ -147,6 +158,27 @@ def best_split(problem: HoldProblem) -> Split:
     return _from(problem, regret, _bisect(problem, _total), _total)
 
 
+def settled_regret(problem: HoldProblem, hold: float) -> float:
+    """`regret` with the exponents that convergence has (e in `learner.theory.bounds`), N in [0, W - 1].
+
+        C_1 (1 - (1 - x)^(G - 1)) / x + N C_1 (1 - x)^(G - 1) + R^env(N),    G >= 1
+
+    without the C_0 of its R^pi, which is the same for every N.
+    """
+    if hold > problem.window - 1:
+        raise ConfigError("hold", hold, f"must be in [0, {problem.window - 1}]: it needs an update")
+    environment, exponent = environment_regret(problem, hold), (_update(problem, hold) - 1.0)
+    left = math.exp(exponent * math.log1p(-problem.rate))
+    return problem.c_1 * ((1.0 - left) / problem.rate + hold * left) + environment
+
+
+def best_settled_split(problem: HoldProblem) -> Split:
+    """The integer N in [0, W - 1] of the least `settled_regret`: that of `best_split`, or one less."""
+    if not problem.convex:
+        return _least_of(problem, settled_regret, range(problem.window))
+    return _from(problem, settled_regret, _bisect(problem, _settled), _settled)
+
+
 def best_policy_split(problem: HoldProblem) -> Split:
     """The integer N of the least R^pi alone: 0, and N = 1 is exactly as good (the lemma names 0 alone)."""
     return _from(problem, policy_regret, _bisect(problem, _policy), _policy)
@@ -181,6 +213,13 @@ def _environment(problem: HoldProblem, hold: int) -> Change:
 def _total(problem: HoldProblem, hold: int) -> Change:
     (policy, _), (up, down) = _policy(problem, hold), _environment(problem, hold)
     return policy + up, down
+
+
+def _settled(problem: HoldProblem, hold: int) -> Change:
+    if hold >= problem.window - 1:
+        return 1.0, 0.0  # no update would be left: no way on
+    (policy, _), (up, down) = _policy(problem, hold), _environment(problem, hold)
+    return policy / (1.0 - problem.rate) + up, down
 
 
 def _direction(change: Change) -> int:

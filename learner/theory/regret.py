@@ -12,7 +12,8 @@ import numpy as np
 
 from learner.tabular.table import npg_step
 from learner.theory import values
-from learner.theory.mdp import Floats, TimeElapsingMdp, check_policies
+from learner.theory.bounds import check_rate
+from learner.theory.mdp import Floats, TimeElapsingMdp, check_discount, check_policies
 from rtcore.config import ConfigError
 from rtcore.windows import Schedule
 
@@ -61,7 +62,12 @@ def by_phase(regret: Floats, schedule: Schedule, *, first: int = 0) -> PhaseRegr
     """The regret of the units first, first + 1, ..., [n], summed by the phase that each lies in.
 
     Unit t is updated in if t is in [t_m, t_m + G_m), although it is executed with pi^g of g = t - t_m.
+
+    Raises:
+        ConfigError: the regret is not of one number per unit.
     """
+    if np.ndim(regret) != 1:
+        raise ConfigError("regret.shape", np.shape(regret), "must be [n], one number per unit")
     windows = (schedule.window_at(first + i) for i in range(len(regret)))
     updating = np.array([first + i < window.hold_start for i, window in enumerate(windows)], bool)
     return PhaseRegret(float(regret[updating].sum()), float(regret[~updating].sum()))
@@ -79,7 +85,18 @@ def iterates(
         eta: learning rate, in (0, (1 - gamma) / tau].
         tau: weight of the entropy, > 0, in units of reward.
         gamma: discount per step.
+
+    Raises:
+        ConfigError: G < 0, tables of different shapes, or an eta, a tau or a gamma out of its range.
     """
+    check_discount(gamma, None)
+    check_rate(eta, tau, gamma)
+    if number < 0:
+        raise ConfigError("number", number, "must be >= 0: G of the window")
+    if np.shape(log_policy) != np.shape(forecast):
+        raise ConfigError(
+            "forecast.shape", np.shape(forecast), f"must be log_policy's, {np.shape(log_policy)}"
+        )
     made = [log_policy]
     for _ in range(number):
         made.append(npg_step(made[-1], forecast, eta=eta, entropy=tau, gamma=gamma))
@@ -88,5 +105,7 @@ def iterates(
 
 def executed(log_iterates: Floats, hold: int) -> Floats:
     """pi_t of a window's units t_m .. t_{m+1} - 1, [G + N, S, A]: pi^0 .. pi^{G-1}, then pi^G held."""
+    if hold < 0:
+        raise ConfigError("hold", hold, "must be >= 0: N of the window")
     update = len(log_iterates) - 1
     return np.exp(log_iterates[np.minimum(np.arange(update + hold), update)])

@@ -2,6 +2,8 @@
 
 Every function takes R [..., S, A] and P [..., S, A, S] with any leading axes, such as the units of a
 time-elapsing MDP, and returns arrays with the same ones. What is the same in all of them is not copied.
+What has no value is refused with a ConfigError: gamma outside [0, 1), H < 1, tau <= 0, a row of P that is no
+distribution, numbers that are not finite, shapes that do not fit.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from learner.tabular.table import log_normalised
-from learner.theory.mdp import Floats, check_discount
+from learner.theory.mdp import Floats, check_discount, check_distributions
 from rtcore.config import ConfigError
 
 # Improvements below this share of the largest value are rounding: policy iteration would follow them in
@@ -46,9 +48,10 @@ def evaluate(
     Source: Puterman (1994), sections 4.2 and 6.1.
     """
     check_discount(gamma, horizon)
+    _check_mdp(reward, transition)
+    _check_table("policy", policy, reward.shape[-2:])
     if horizon is None:
-        v = _solve(transition, policy, (policy * reward).sum(-1), gamma)
-        return Values(backup(reward, transition, v, gamma), v)
+        return _evaluate(reward, transition, policy, gamma)
     q, v = reward, np.zeros(np.broadcast_shapes(reward.shape, policy.shape)[:-1])
     for _ in range(horizon):
         q = backup(reward, transition, v, gamma)
@@ -62,6 +65,7 @@ def optimal(reward: Floats, transition: Floats, *, gamma: float, horizon: int | 
     Source: Puterman (1994), sections 4.3 and 6.4.
     """
     check_discount(gamma, horizon)
+    _check_mdp(reward, transition)
     if horizon is None:
         return _policy_iteration(reward, transition, gamma)
     q, v = reward, np.zeros(reward.shape[:-1])
@@ -82,9 +86,9 @@ def soft_evaluate(
     """
     check_discount(gamma, None)
     _check_entropy(tau)
-    policy = np.exp(log_policy)
-    v = _solve(transition, policy, (policy * (reward - tau * log_policy)).sum(-1), gamma)
-    return Values(backup(reward, transition, v, gamma), v)
+    _check_mdp(reward, transition)
+    _check_table("log_policy", log_policy, reward.shape[-2:])
+    return _soft_evaluate(reward, transition, log_policy, gamma, tau)
 
 
 def soft_optimal(reward: Floats, transition: Floats, *, gamma: float, tau: float) -> SoftOptimum:
@@ -99,7 +103,7 @@ def soft_optimal(reward: Floats, transition: Floats, *, gamma: float, tau: float
     q = optimal(reward, transition, gamma=gamma).q
     for _ in range(_MOST_STEPS):
         before, log_policy = q, log_normalised(q / tau)
-        q = soft_evaluate(reward, transition, log_policy, gamma=gamma, tau=tau).q
+        q = _soft_evaluate(reward, transition, log_policy, gamma, tau).q
         if np.abs(q - before).max() <= _SETTLED * _size(q):
             break
     log_policy = log_normalised(q / tau)
@@ -112,6 +116,19 @@ def backup(reward: Floats, transition: Floats, v: Floats, gamma: float) -> Float
     return q
 
 
+def _evaluate(reward: Floats, transition: Floats, policy: Floats, gamma: float) -> Values:
+    v = _solve(transition, policy, (policy * reward).sum(-1), gamma)
+    return Values(backup(reward, transition, v, gamma), v)
+
+
+def _soft_evaluate(
+    reward: Floats, transition: Floats, log_policy: Floats, gamma: float, tau: float
+) -> Values:
+    policy = np.exp(log_policy)
+    v = _solve(transition, policy, (policy * (reward - tau * log_policy)).sum(-1), gamma)
+    return Values(backup(reward, transition, v, gamma), v)
+
+
 def _solve(transition: Floats, policy: Floats, reward: Floats, gamma: float) -> Floats:
     """V of the Markov chain under `policy` that pays `reward` [..., S] per step."""
     moves = np.einsum("...sa,...sat->...st", policy, transition)
@@ -122,7 +139,7 @@ def _solve(transition: Floats, policy: Floats, reward: Floats, gamma: float) -> 
 def _policy_iteration(reward: Floats, transition: Floats, gamma: float) -> Values:
     action = reward.argmax(-1)
     while True:  # there are finitely many policies, and each is strictly better than the one before
-        values = evaluate(reward, transition, np.eye(reward.shape[-1])[action], gamma=gamma)
+        values = _evaluate(reward, transition, np.eye(reward.shape[-1])[action], gamma)
         kept = np.take_along_axis(values.q, action[..., None], -1)[..., 0]
         better = values.q.max(-1) > kept + _ROUNDING * _size(values.q)
         if not better.any():
@@ -132,6 +149,26 @@ def _policy_iteration(reward: Floats, transition: Floats, gamma: float) -> Value
 
 def _size(values: Floats) -> float:
     return max(1.0, float(np.abs(values).max()))
+
+
+def _check_mdp(reward: Floats, transition: Floats) -> None:
+    """With rows that sum to more than 1 policy iteration need not end, and with NaN it would end at once."""
+    if reward.ndim < 2 or not reward.size:
+        raise ConfigError("reward.shape", reward.shape, "must be [..., S, A], none of them empty")
+    states, actions = reward.shape[-2:]
+    _check_table("reward", reward, (states, actions))
+    if transition.shape[-3:] != (states, actions, states):
+        allowed = f"must end with [S, A, S] = {(states, actions, states)}"
+        raise ConfigError("transition.shape", transition.shape, allowed)
+    check_distributions("transition", transition)
+
+
+def _check_table(name: str, table: Floats, shape: tuple[int, ...]) -> None:
+    if table.shape[-2:] != shape:
+        raise ConfigError(f"{name}.shape", table.shape, f"must end with [S, A] = {shape}")
+    if not np.isfinite(table).all():
+        where = np.argwhere(~np.isfinite(table))[0].tolist()
+        raise ConfigError(f"{name}{where}", float(table[tuple(where)]), "must be finite")
 
 
 def _check_entropy(tau: float) -> None:

@@ -90,6 +90,32 @@ def test_a_total_counts_what_the_horizon_may_add() -> None:
     assert Terms(1.0, 2.0, 4.0, 8.0).total == 15.0
 
 
+def test_the_gaps_between_two_units_by_hand() -> None:
+    # gamma = 1/2, H = 2: h = 1.5, k = 0.5. Q*: 1.5 (3 + 4 / 0.5 * 0.25); V^pi: 1.5 * 3 + 0.5 * 4 * 0.25
+    change = Budget(3.0, 0.25)
+    assert bounds.optimal_gap(0.5, 4.0, change, 2) == pytest.approx(7.5)
+    assert bounds.same_policy_gap(0.5, 4.0, change, 2) == pytest.approx(5.0)
+    assert bounds.same_policy_gap(0.5, 4.0, change, 2, printed=True) == pytest.approx(4.625)
+
+
+def test_phases_that_cannot_be_are_refused() -> None:
+    for update, hold, said in ((-1, 1, "update = -1: must be >= 0"), (1, -1, "hold = -1: must be >= 0")):
+        for bound in (bounds.hold_bound, bounds.theorem1):
+            with pytest.raises(ConfigError, match=said):
+                bound(PLAIN, 8.0, 0.1, CHANGED, update, hold)
+    with pytest.raises(ConfigError, match="update = -1: must be >= 0"):
+        bounds.update_bound(PLAIN, 8.0, 0.1, CHANGED, -1)
+    with pytest.raises(ConfigError, match="update = 0: must be >= 1"):
+        bounds.settled_update_bound(PLAIN, Start(1.0, 4.0), 8.0, 0.1, CHANGED, 0, 0.5)
+    with pytest.raises(ConfigError, match="update = 0: must be >= 1"):
+        bounds.settled_hold_bound(PLAIN, 8.0, 0.1, CHANGED, 0, 1)
+    with pytest.raises(ConfigError, match="hold = -1: must be >= 0"):
+        bounds.settled_hold_bound(PLAIN, 8.0, 0.1, CHANGED, 2, -1)
+    for delta in (-0.1, math.nan):
+        with pytest.raises(ConfigError, match=r"delta = .*: must be >= 0"):
+            bounds.theorem1(PLAIN, 8.0, delta, CHANGED, 2, 3)
+
+
 def test_no_random_mdps_are_further_apart_than_their_budgets() -> None:
     rng, printed_broken = np.random.default_rng(0), 0
     for _ in range(1000):

@@ -46,6 +46,20 @@ def test_the_corollary_is_the_proposition_for_good_estimates() -> None:
     assert forecast_error.settled_bound(np.full(4, 0.25), 3.0, q_max=100.0) == pytest.approx(6.0)
 
 
+@pytest.mark.parametrize("l_p", [2, 3, 5, 20, 50])
+@pytest.mark.parametrize("ahead", [1, 5, 20])
+def test_the_l_of_proposition_1_in_closed_form(l_p: int, ahead: int) -> None:
+    # w_k = 1 / l_p + d (x_k - xbar) / Sxx with d = ahead + (l_p - 1) / 2 and Sxx = l_p (l_p^2 - 1) / 12, so
+    # sum w = 1 and ||w||^2 = 1 / l_p + d^2 / Sxx; at l_p = 2, ahead = 1: 1/2 + 2.25 * 2 = 5
+    weights = forq.fit(ForecastConfig(), [float(k) for k in range(1 - l_p, 1)], float(ahead))
+    distance = ahead + (l_p - 1) / 2
+    square = 1 / l_p + 12 * distance**2 / (l_p * (l_p**2 - 1))
+    assert math.fsum(weights) == pytest.approx(1.0, abs=1e-12)
+    assert float(weights @ weights) == pytest.approx(square, rel=1e-12)
+    if (l_p, ahead) == (2, 1):
+        assert square == 5.0
+
+
 def test_no_forecast_in_a_random_world_is_further_off() -> None:
     rng, ratios = np.random.default_rng(0), []
     for _ in range(300):

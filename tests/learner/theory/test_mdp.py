@@ -53,6 +53,18 @@ def test_the_arrays_of_a_world_are_its_own() -> None:
         ),
         (np.zeros((1, 1, 2)), np.array([[[[1.0], [0.9]]]]), 0.5, None, "transition[0, 0, 1] = [0.9]: must"),
         (np.zeros((1, 2, 1)), np.array([[[[2.0, -1.0]], [[1, 0]]]]), 0.5, None, "transition[0, 0, 0] = [2.0"),
+        (np.zeros((1, 1, 2)), np.array([[[[1.0], [np.nan]]]]), 0.5, None, "transition[0, 0, 1, 0] = nan"),
+        (
+            np.zeros((1, 2, 1)),
+            np.full((1, 2, 1, 3), 1 / 3),
+            0.5,
+            None,
+            "transition.shape = (1, 2, 1, 3): must",
+        ),
+        ([[[0.0], [0.0, 1.0]]], np.ones((1, 2, 1, 2)), 0.5, None, "reward = [[[0.0], [0.0, 1.0]]]: must be"),
+        (np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1)), -0.1, None, "gamma = -0.1: must be in [0, 1)"),
+        (np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1)), 0.5, 2.5, "horizon = 2.5: must be a whole number"),
+        (np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1)), 0.5, np.inf, "horizon = inf: must be a whole number"),
         (np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1)), 1.0, None, "gamma = 1.0: must be in [0, 1)"),
         (np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1)), float("nan"), None, "gamma = nan: must be in [0, 1)"),
         (np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1)), 0.5, 0, "horizon = 0: must be a whole number >= 1"),
@@ -125,6 +137,25 @@ def test_an_interval_outside_of_the_world_is_refused(interval: tuple[int, int]) 
     for sum_up in (budgets.local, budgets.cumulative, budgets.cumulative_right):
         with pytest.raises(ConfigError, match="interval"):
             sum_up(np.ones(3), *interval)
+
+
+def test_a_phase_without_units_has_no_budget() -> None:
+    for sum_up in (budgets.local, budgets.cumulative, budgets.cumulative_right):
+        assert sum_up(np.ones(3), 2, 2) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (np.ones((3, 1)), r"changes.shape = \(3, 1\): must be \[T - 1\]"),
+        (np.array([1.0, -2.0]), r"changes = \[1.0, -2.0\]: must be >= 0"),
+        (np.array([np.nan]), "changes = .*nan.*: must be >= 0"),
+    ],
+)
+def test_what_are_no_changes_is_refused(changes: np.ndarray, said: str) -> None:
+    for sum_up in (budgets.local, budgets.cumulative, budgets.cumulative_right):
+        with pytest.raises(ConfigError, match=said):
+            sum_up(changes, 0, 1)
 
 
 def _both_phases(b: np.ndarray) -> list[float]:

@@ -12,11 +12,13 @@ from learner.theory.optimum import (
     HoldProblem,
     best_environment_split,
     best_policy_split,
+    best_settled_split,
     best_split,
     environment_regret,
     geometric_sum,
     policy_regret,
     regret,
+    settled_regret,
 )
 from learner.theory.stationarity import (
     closed_form_hold,
@@ -108,6 +110,36 @@ def test_the_integer_minimum_is_that_of_enumeration() -> None:
             assert all(value > found.value * (1 - 1e-9) for value in tried[: found.hold])
 
 
+def test_settled_terms_and_split_by_hand() -> None:
+    # As above with G - 1 in place of G: R^pi = 16 (1 - 2^(1-G)) + 8 N 2^(1-G) = 12, 12, 16 for N = 0, 1, 2
+    found = [settled_regret(BY_HAND, hold) for hold in range(3)]
+    assert found == pytest.approx([12 + 14, 12 + 7, 16 + 6], rel=1e-14)
+    assert best_settled_split(BY_HAND).hold == 1
+    # C_1 = 3: 3/8 of the first terms, 4.5, 4.5, 6 beside 5.25, 5.25, 6, 9. A unit less of hold is best.
+    softer = replace(BY_HAND, c_1=3.0)
+    assert [settled_regret(softer, hold) for hold in range(3)] == pytest.approx([18.5, 11.5, 12])
+    assert values(softer) == pytest.approx([19.25, 12.25, 12, 22])
+    assert (best_settled_split(softer).hold, best_split(softer).hold) == (1, 2)
+    assert best_settled_split(replace(BY_HAND, b_1=0.0, b_2=0.0)).ties == (0, 1)
+    with pytest.raises(ConfigError, match=r"hold = 3: must be in \[0, 2\]"):
+        settled_regret(BY_HAND, 3)
+
+
+def test_the_settled_hold_is_that_of_enumeration_and_at_most_a_unit_shorter() -> None:
+    random, shorter = np.random.default_rng(7), 0
+    for _ in range(1000):
+        problem = draw(random)
+        tried = [settled_regret(problem, hold) for hold in range(problem.window)]
+        found, printed = best_settled_split(problem), best_split(problem)
+        assert tried[found.hold] == found.value <= min(tried) * (1 + 1e-9)
+        assert printed.hold - found.hold in (0, 1)
+        shorter += printed.hold > found.hold
+        uneven = replace(problem, alpha_1=1 / problem.alpha_1)
+        least = min(settled_regret(uneven, hold) for hold in range(problem.window))
+        assert best_settled_split(uneven).value == least
+    assert 100 < shorter < 200  # 17 % of 3000
+
+
 def test_corrected_closed_form_is_right_and_the_printed_one_is_not() -> None:
     """Of {floor, floor + 1}, clipped to the window, one is the integer minimum."""
     random = np.random.default_rng(3)
@@ -135,6 +167,14 @@ def test_closed_form_by_hand_and_at_equal_growth() -> None:
     assert closed_form_hold(equal) == pytest.approx(11.0, abs=1e-9)
     assert math.isnan(closed_form_hold_printed(equal))
     assert closed_form_hold(replace(equal, alpha_1=1.1 + 1e-9)) == pytest.approx(11.0, abs=1e-6)
+
+
+def test_both_equations_by_hand() -> None:
+    # BY_HAND at N = 1, G = 2: ln(1 - x) = -ln 2. Corrected 8 ((1 - 2) (-ln 2) - 1) / 4 = 2 ln 2 - 2, printed
+    # 8 (0 - 1) / 4 = -2; and 2 (ln 2 / 1 * 4 - ln 3 / 2 * 1/2 * 3)
+    environment = 8 * math.log(2) - 1.5 * math.log(3)
+    assert stationarity(BY_HAND, 1.0) == pytest.approx(2 * math.log(2) - 2 + environment, rel=1e-14)
+    assert stationarity_printed(BY_HAND, 1.0) == pytest.approx(-2 + environment, rel=1e-14)
 
 
 def test_derivative_at_a_point() -> None:
@@ -210,6 +250,8 @@ def test_limits_of_the_environment_term(change: dict[str, float], hold: int, tie
     ("name", "value", "words"),
     [
         ("window", 0, "at least 1"),
+        ("window", 2.5, "a whole number"),
+        ("window", math.nan, "a whole number"),
         ("c_1", -1.0, "at least 0"),
         ("c_45", math.nan, "at least 0"),
         ("alpha_1", 0.0, "above 0"),

@@ -86,6 +86,24 @@ def test_a_window_s_regret_is_that_of_algorithm_1_step_by_step() -> None:
         np.testing.assert_allclose(certificates.measured(case), expected, rtol=1e-9, atol=1e-9)
 
 
+def test_what_no_window_makes_is_refused() -> None:
+    policy, q = np.log(np.full((3, 2), 0.5)), np.zeros((3, 2))
+    rates = {"eta": 0.1, "tau": 0.5, "gamma": 0.5}
+    for wrong, said in (
+        ({"gamma": 1.0}, "gamma = 1.0"), ({"tau": 0.0}, "tau = 0.0"), ({"eta": 1.1}, "eta = 1.1"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=said):
+            regret.iterates(policy, q, 2, **(rates | wrong))
+    with pytest.raises(ConfigError, match="number = -1"):
+        regret.iterates(policy, q, -1, **rates)
+    with pytest.raises(ConfigError, match=r"forecast.shape = \(2, 2\): must be log_policy's, \(3, 2\)"):
+        regret.iterates(policy, q[:2], 2, **rates)
+    with pytest.raises(ConfigError, match="hold = -1"):
+        regret.executed(policy[None], -1)
+    with pytest.raises(ConfigError, match=r"regret.shape = \(2, 2\)"):
+        regret.by_phase(np.ones((2, 2)), FixedSchedule(3, 2 / 3))
+
+
 def test_what_was_not_executed_here_is_refused() -> None:
     world = bandit([[1, 0], [0, 1]])
     with pytest.raises(ConfigError, match=r"units = \(1, 3\)"):

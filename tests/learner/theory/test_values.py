@@ -135,3 +135,37 @@ def test_what_has_no_value_is_refused(gamma: float, tau: float, named: str) -> N
     if named == "gamma":
         with pytest.raises(ConfigError, match="gamma"):
             values.optimal(REWARD, MOVES, gamma=gamma)
+
+
+STAY = np.full((2, 2), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("reward", "moves", "said"),
+    [
+        (REWARD, 2 * MOVES, r"transition\[0, 0\] = \[2.0, 0.0\]: must be >= 0 and sum to 1"),
+        (REWARD, MOVES - [[[0.5, -0.5]]], r"transition\[0, 1\] = \[-0.5, 1.5\]: must be >= 0"),
+        (REWARD, MOVES * np.nan, r"transition\[0, 0\] = \[nan, nan\]: must be >= 0"),
+        (REWARD, MOVES[:1], r"transition.shape = \(1, 2, 2\): must end with \[S, A, S\] = \(2, 2, 2\)"),
+        (REWARD[0], MOVES, r"reward.shape = \(2,\): must be \[..., S, A\]"),
+        (REWARD[:0], MOVES, r"reward.shape = \(0, 2\): must be"),
+        (REWARD + np.inf, MOVES, r"reward\[0, 0\] = inf: must be finite"),
+    ],
+)
+def test_what_is_no_mdp_is_refused(reward: np.ndarray, moves: np.ndarray, said: str) -> None:
+    for horizon in (None, 3):
+        with pytest.raises(ConfigError, match=said):
+            values.optimal(reward, moves, gamma=0.9, horizon=horizon)
+        with pytest.raises(ConfigError, match=said):
+            values.evaluate(reward, moves, STAY, gamma=0.9, horizon=horizon)
+    with pytest.raises(ConfigError, match=said):
+        values.soft_optimal(reward, moves, gamma=0.9, tau=0.1)
+    with pytest.raises(ConfigError, match=said):
+        values.soft_evaluate(reward, moves, np.log(STAY), gamma=0.9, tau=0.1)
+
+
+def test_a_policy_of_another_world_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"policy.shape = \(3, 2\): must end with \[S, A\] = \(2, 2\)"):
+        values.evaluate(REWARD, MOVES, np.full((3, 2), 0.5), gamma=0.5)
+    with pytest.raises(ConfigError, match=r"log_policy\[0, 1\] = -inf: must be finite"):
+        values.soft_evaluate(REWARD, MOVES, np.array([[0.0, -np.inf], [0, 0]]), gamma=0.5, tau=0.1)
