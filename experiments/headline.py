@@ -28,6 +28,7 @@ from experiments.headline_picture import Curves, Ratio, draw
 from experiments.headline_worlds import BURN, UNITS, Floats, Luck, Setting, make_worlds
 from experiments.intervals import Interval, interval
 from launcher.machine import machine
+from learner.schedule.plan import LEAST_GAIN, LEAST_TRUST
 
 UPDATES = (2, 5, 7, 10, 14, WINDOW)  # G
 NO_HOLD = f"G={WINDOW}"
@@ -44,6 +45,8 @@ OTHERS = {
     "plan": Arm(update="plan"),
     "plan, 10 %": Arm(update="plan", least_gain=0.1),
     "plan, shrunk": Arm(update="plan", shrink=True),
+    "auto": Arm(update="plan", least_gain=LEAST_GAIN, least_trust=LEAST_TRUST, moving=True),
+    "auto_bound": Arm(update="bound"),
 }
 ARMS = FIXED | HOLD_FIRST | MATCHED | EXACT | OTHERS
 # What is paired beyond no hold: a hold and its rate, a forecast and none, a plan and what it competes with.
@@ -54,6 +57,10 @@ DIFFERENCES = (
     *((f"exact, G={update}", f"exact, {NO_HOLD}") for update in UPDATES[:-1]),
     ("plan", "G=7"),
     ("plan", "live"),
+    ("auto", "G=7"),
+    ("auto", "plan"),
+    ("auto", "live"),
+    ("auto_bound", "G=7"),
 )
 DRIFTING, STATIONARY = Setting(), Setting(period=None)
 FAMILY = tuple(
@@ -88,6 +95,7 @@ class Found(NamedTuple):
     in_window: Mapping[str, Floats]  # [W, n], of the units of a window, mean over windows
     update: Mapping[str, float]  # mean G
     late: Mapping[str, Floats]  # [n], per step of the last `LATE` units, when no arm is still starting
+    late_update: Mapping[str, float]  # mean G of these
 
 
 class Share(NamedTuple):
@@ -107,8 +115,9 @@ def run(setting: Setting, seeds: range, arms: Mapping[str, Arm]) -> Found:
     return Found(
         dict(zip(arms, counted.mean(1), strict=True)),
         dict(zip(arms, by_window, strict=True)),
-        dict(zip(arms, update.mean(1).tolist(), strict=True)),
+        dict(zip(arms, update[:, BURN:].mean((1, 2)).tolist(), strict=True)),
         dict(zip(arms, regret[:, -LATE:].mean(1), strict=True)),
+        dict(zip(arms, update[:, -LATE:].mean((1, 2)).tolist(), strict=True)),
     )
 
 
@@ -215,6 +224,7 @@ def record(setting: Setting, found: Found) -> dict[str, Any]:
             "below_no_hold": wins(found, arm),
             "mean_update": round(found.update[arm], 2),
             "late": _plain(interval(found.late[arm])),
+            "late_update": round(found.late_update[arm], 2),
         }
         if setting in {DRIFTING, STATIONARY}:
             row["arms"][arm]["by_lane"] = [round(float(value), 6) for value in regret]
@@ -233,11 +243,11 @@ def picture(results: Mapping[Setting, Found], path: Path) -> None:
             "true future Q*": EXACT,
         }
         over = {name: [interval(found.regret[arm]) for arm in arms] for name, arms in rows.items()}
-        flat = {arm: interval(found.regret[arm]) for arm in ("plan", "live")}
+        flat = {arm: interval(found.regret[arm]) for arm in ("auto", "live")}
         curves[title] = Curves(UPDATES, over, flat)
     inside = {
         arm: results[DRIFTING].in_window[arm].mean(-1)
-        for arm in (NO_HOLD, "G=7", "exact, G=20", "plan", "live")
+        for arm in (NO_HOLD, "G=7", "exact, G=20", "auto", "live")
     }
     table = {
         str(setting): {arm: Ratio(_ratio(found, arm), less(found, arm).apart) for arm in COLUMNS}

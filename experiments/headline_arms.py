@@ -16,6 +16,8 @@ import numpy as np
 
 from experiments.headline_worlds import EPISODE_STEPS, GAMMA, Floats, Index, Luck, Worlds
 from learner.forecast.forq import fit
+from learner.schedule.bound import bound_choice
+from learner.schedule.plan import advantage_change, choose, predicted_regret, slope_trust
 from learner.tabular.table import mix, npg_step, q_update
 from learner.theory.regret import iterates
 from rtcore.config import ForecastConfig
@@ -26,7 +28,6 @@ STEP_SIZE = 0.3  # of Q-learning
 EXPLORE = 0.5  # share of random actions: with the policy's alone, the end that is avoided is never heard of
 L_P = 20  # past tables that a forecast is fitted to, a unit apart
 MOST = 1.0 / (1.0 - GAMMA)  # no |Q*| is larger, and forecasts are clipped to it
-SHRINK = 10.0  # times the slopes' variance; residuals of neighbouring tables are far from independent
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Arm:
 
     Attributes:
         update: G, units of a window in which the policy is improved; "plan": chosen in each window, as the
-            one that the forecasts of all its units predict the least regret for.
+            one that the forecasts of all its units predict the least regret for; "bound": the one that
+            Theorem 1 is least for, with estimates in it.
         first: whether the hold comes after the update, as in the paper, or before it.
         matched: never hold, and improve in every unit by as little as makes up G steps of the setting's eta.
         refresh: when what the policy is improved towards is made: at t_m, or anew in each unit.
@@ -43,15 +45,19 @@ class Arm:
             none: it is the newest table itself. "exact": the true Q* of the window's end, which nobody knows.
         shrink: whether slopes that could be noise count for less.
         least_gain: "plan": hold only if that is predicted to save this share of the regret of no hold.
+        least_trust: "plan": hold only if more than this share of the slopes is no noise; None: hold anyway.
+        moving: "plan": hold only if some advantage is predicted to change by more than tau in the window.
     """
 
-    update: int | Literal["plan"] = WINDOW
+    update: int | Literal["plan", "bound"] = WINDOW
     first: Literal["update", "hold"] = "update"
     matched: bool = False
     refresh: Literal["window", "unit"] = "window"
     ahead: Literal["end", "next", "none", "exact"] = "end"
     shrink: bool = False
     least_gain: float = 0.0
+    least_trust: float | None = None
+    moving: bool = False
 
 
 class Learner:
@@ -69,10 +75,11 @@ class Learner:
         self._optimal = optimal
         shape = optimal.shape[1:]
         if arm.matched:
-            assert arm.update != "plan", "an arm with a rate for G needs a G"
+            assert isinstance(arm.update, int), "an arm with a rate for G needs a G"
             self._eta = matched_rate(eta, arm.update)
         self.log_policy: Floats = np.full(shape, -np.log(shape[-1]))
-        self.update: Index = np.full(shape[0], WINDOW if arm.update == "plan" or arm.matched else arm.update)
+        fixed = arm.update if isinstance(arm.update, int) and not arm.matched else WINDOW
+        self.update: Index = np.full(shape[0], fixed)
         self._past: Floats = np.zeros((1, *shape))
 
     def end_unit(self, t: int, tables: Floats) -> None:
@@ -83,6 +90,8 @@ class Learner:
             self._past = tables[-L_P:].copy()
         if g == 0 and self._arm.update == "plan":
             self.update = self._planned()
+        if g == 0 and self._arm.update == "bound":
+            self.update = self._bounded()
         active = g < self.update if self._arm.first == "update" else g >= WINDOW - self.update
         if active.any():
             target = self._optimal[end] if self._arm.ahead == "exact" else self._target(g)
@@ -101,7 +110,22 @@ class Learner:
     def _planned(self) -> Index:
         q = np.stack([forecast(self._past, k, shrink=self._arm.shrink) for k in range(WINDOW + 1)])
         made = iterates(self.log_policy, q[-1], WINDOW, eta=self._eta, tau=TAU, gamma=GAMMA)
-        return plan(q, np.exp(made), least_gain=self._arm.least_gain)
+        least_trust = self._arm.least_trust
+        return choose(
+            predicted_regret(q, np.exp(made)),
+            None if least_trust is None else slope_trust(self._past, np.arange(float(len(self._past)))),
+            advantage_change(q) if self._arm.moving else None,
+            least_change=TAU,
+            least_gain=self._arm.least_gain,
+            least_trust=least_trust or 0.0,
+        )
+
+    def _bounded(self) -> Index:
+        target = forecast(self._past, WINDOW, shrink=False)
+        slope = np.tensordot(_weights(len(self._past), 1) - _weights(len(self._past), 0), self._past, 1)
+        return bound_choice(
+            self.log_policy, target, slope, window=WINDOW, eta=self._eta, tau=TAU, gamma=GAMMA
+        )
 
 
 def matched_rate(eta: float, update: int) -> float:
@@ -116,28 +140,15 @@ def matched_rate(eta: float, update: int) -> float:
 def forecast(past: Floats, ahead: float, *, shrink: bool) -> Floats:
     """ForQ of tables of neighbouring units, [l, ..., S, A], `ahead` units after the last; clipped.
 
-    With `shrink` the slopes are multiplied by rho = clip(1 - 10 sum se^2 / sum slope^2, 0, 1), one number per
-    lane, so that the weights remain the same for every (s, a): after James and Stein (1961), se^2 being the
-    slopes' variance if the residuals were independent.
+    With `shrink` the slopes are multiplied by their `slope_trust`, one number per lane, so that the weights
+    remain the same for every (s, a).
     """
     fitted = np.tensordot(_weights(len(past), ahead), past, 1)
     if shrink and len(past) > 2:
         mean = past.mean(0)
-        fitted = mean + _trust(past)[..., None, None] * (fitted - mean)
+        fitted = mean + slope_trust(past, np.arange(float(len(past))))[..., None, None] * (fitted - mean)
     clipped: Floats = np.clip(fitted, -MOST, MOST)
     return clipped
-
-
-def _trust(past: Floats) -> Floats:
-    number = len(past)
-    time = np.arange(number) - (number - 1) / 2
-    spread = float((time**2).sum())
-    slope = np.tensordot(time, past, 1) / spread
-    residual = past - past.mean(0) - np.multiply.outer(time, slope)
-    variance = (residual**2).sum((0, -2, -1)) / ((number - 2) * spread)
-    size = (slope**2).sum((-2, -1))
-    trust: Floats = np.clip(1.0 - SHRINK * variance / np.maximum(size, 1e-300), 0.0, 1.0)
-    return trust
 
 
 @lru_cache(maxsize=1024)
@@ -145,31 +156,11 @@ def _weights(known: int, ahead: float) -> Floats:
     return fit(ForecastConfig(basis="identity"), list(np.arange(1.0 - known, 1.0)), ahead)
 
 
-def plan(q: Floats, policy: Floats, *, least_gain: float = 0.0) -> Index:
-    """The G in 1 .. W of the least predicted regret, of each lane, [n].
-
-        predicted(G) = sum_{k=0}^{W} mean_s [max_a Qtilde_k(s, a) - sum_a pi^{min(k, G)}(a|s) Qtilde_k(s, a)]
-
-    The last unit, t_{m+1}, counts: pi^G still acts in it.
-
-    Args:
-        q: Qtilde_{t_m + k}, [W + 1, n, S, A].
-        policy: pi^g, [W + 1, n, S, A].
-        least_gain: G = W unless another one saves this share of what is predicted for W.
-    """
-    earned = np.einsum("knsa,gnsa->kgn", q, policy) / q.shape[2]
-    gap = q.max(-1).mean(-1)[:, None] - earned
-    k = np.arange(len(q))
-    predicted = np.stack([gap[k, np.minimum(k, update)].sum(0) for update in k[1:]])
-    gain = predicted[-1] - predicted.min(0)
-    return np.where(gain < least_gain * predicted[-1], len(predicted), predicted.argmin(0) + 1)
-
-
 def live(worlds: Worlds, arms: Sequence[Arm], eta: float, luck: Luck) -> tuple[Floats, Floats]:
     """All arms with the same chance.
 
     Returns:
-        V*_t - V^{pi_t}_t, exact, [arms, T, n]; and the mean G of each arm's windows, [arms, n].
+        V*_t - V^{pi_t}_t, exact, and G of the window that the unit is in, both [arms, T, n].
     """
     units = len(luck.start)
     best = worlds.optimal()
@@ -177,7 +168,7 @@ def live(worlds: Worlds, arms: Sequence[Arm], eta: float, luck: Luck) -> tuple[F
     learners = [Learner(arm, eta, best.q) for arm in arms]
     tables = np.zeros((units, len(arms), lanes, states, actions))
     policies = np.empty_like(tables)
-    held = np.zeros((len(arms), lanes))
+    update = np.zeros((len(arms), units, lanes))
     q = np.zeros((len(arms) * lanes, states, actions))
     rollout = _Rollout(worlds, len(arms), luck)
     for t in range(units):
@@ -186,9 +177,9 @@ def live(worlds: Worlds, arms: Sequence[Arm], eta: float, luck: Luck) -> tuple[F
         tables[t] = q.reshape(tables[t].shape)
         for i, learner in enumerate(learners):
             learner.end_unit(t, tables[max(0, t + 1 - L_P) : t + 1, i])
-            held[i] += learner.update / units
+            update[i, t] = learner.update
     regret = [best.v[:units] @ worlds.start - worlds.lived(policies[:, i]) for i in range(len(arms))]
-    return np.stack(regret), held
+    return np.stack(regret), update
 
 
 class _Rollout:

@@ -18,8 +18,8 @@ from experiments.intervals import Interval
 
 Floats = NDArray[np.float64]
 COLOURS = ("#d1495b", "#c98a1b", "#1f78b4", "#888888")  # of the curves over G, in their order
-FLAT = {"plan": "#7b5ea7", "live": "#4a9d5b"}
-INSIDE = ("#222222", "#d1495b", "#888888", FLAT["plan"], FLAT["live"])
+FLAT = {"auto": "#7b5ea7", "live": "#4a9d5b"}
+INSIDE = ("#222222", "#d1495b", "#888888", FLAT["auto"], FLAT["live"])
 FAR = np.log2(4)  # ratios from a quarter or four times on have the full colour
 
 
@@ -99,10 +99,15 @@ def _table(axes: Axes, rows: Mapping[str, Mapping[str, Ratio]]) -> None:
             shade = "white" if abs(far[y, x]) > 0.65 * FAR else "black"
             text = f"{row[arm].value:.2f}"
             axes.text(x, y, text, ha="center", va="center", fontsize=8.5, weight=weight, color=shade)
-    axes.set_xticks(range(len(arms)), [arm.replace(" ", "\n").replace("\n%", " %") for arm in arms])
+    axes.set_xticks(range(len(arms)), [_stacked(arm) for arm in arms])
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set_yticks(np.arange(0.5, len(rows) - 1), minor=True)
     axes.grid(which="minor", axis="y", color="white", linewidth=2)
     axes.tick_params(which="both", length=0, labelsize=8.5)
     axes.xaxis.tick_top()
     axes.spines[:].set_visible(False)
+
+
+def _stacked(arm: str) -> str:
+    """A column's heading, narrow."""
+    return arm.replace(" ", "\n").replace("\n%", " %").replace("_", "_\n")

@@ -27,9 +27,9 @@ from experiments.headline_arms import (
     forecast,
     live,
     matched_rate,
-    plan,
 )
 from experiments.headline_worlds import GAMMA, Floats, Luck, Setting, make_worlds
+from learner.schedule.bound import bound_choice
 from learner.tabular.table import npg_step
 from learner.theory.mdp import TimeElapsingMdp
 from learner.theory.regret import per_unit
@@ -123,21 +123,35 @@ def test_shrinking_by_hand() -> None:
     np.testing.assert_allclose(forecast(past, 1, shrink=True), 3 + 0.75 * 2.5)
 
 
-def test_a_plan_by_hand() -> None:
-    """One state. Action 1 is better by 1 until k = 12, and worse by 0.9 after; pi^g(1) = g / 20.
+def _window_ahead(arm: Arm, past: Floats) -> int:
+    """G at t_m = 20, given the tables of the units 1 .. 20, after a window in which nothing was known."""
+    learner = Learner(arm, 0.2, np.zeros((3 * WINDOW, *SHAPE)))
+    learner.end_unit(WINDOW, past)
+    return int(learner.update[0])
 
-    A unit k <= 12 loses 1 - min(k, G) / 20, another 0.9 min(k, G) / 20. One more update saves 1 / 20 in
-    12 - G units and costs 0.9 / 20 in 8: it pays while 12 - G > 7.2, so G = 5 is best.
-    With it 13 - 50 / 20 + 0.9 x 8 x 5 / 20 = 12.3; with G = 20, 13 - 78 / 20 + 0.9 x 132 / 20 = 15.04.
-    """
-    k = np.arange(WINDOW + 1)
-    q = np.zeros((WINDOW + 1, 1, 1, 2))
-    q[..., 0] = np.where(k <= 12, -1.0, 0.9)[:, None, None]
-    pi = np.stack([1 - k / WINDOW, k / WINDOW], -1)[:, None, None]
-    gain = (15.04 - 12.3) / 15.04
-    assert plan(q, pi).tolist() == [5]
-    assert plan(q, pi, least_gain=gain - 1e-6).tolist() == [5]
-    assert plan(q, pi, least_gain=gain + 1e-6).tolist() == [WINDOW]
+
+def test_a_plan_holds_on_a_line_and_on_noise_only_if_trusted() -> None:
+    """Actions change places late in the coming window, so it pays to do little before; with noise
+    of the same size on the tables, a gate closes."""
+    ahead = 0.1 * (np.arange(20.0) - 34)  # Q(., 0): -1.5 at t_m, 0 at t_m + 15, 0.5 at t_{m+1}
+    line = np.stack([ahead, -ahead], -1)[:, None, None].repeat(2, axis=2)
+    noisy = line + np.random.default_rng(3).normal(0, 2.0, line.shape)
+    gated = Arm(update="plan", least_trust=0.5)
+    assert _window_ahead(gated, line) == _window_ahead(Arm(update="plan"), line) < WINDOW
+    assert _window_ahead(Arm(update="plan"), noisy) < _window_ahead(gated, noisy) == WINDOW
+    assert _window_ahead(Arm(update="plan", least_gain=1.1), line) == WINDOW
+
+
+def test_the_bound_s_choice_of_a_window() -> None:
+    """From the tables' slope: 0 in tables that stay, and of a unit in a line."""
+    line = 0.1 * np.arange(20.0)[:, None, None, None] * np.array([1.0, -1.0]) * np.ones(SHAPE)
+    learner = Learner(Arm(update="bound"), 0.2, np.zeros((3 * WINDOW, *SHAPE)))
+    before, slope = learner.log_policy.copy(), np.broadcast_to(np.array([0.1, -0.1]), SHAPE)
+    learner.end_unit(WINDOW, line)
+    target = line[-1] + WINDOW * slope
+    expected = bound_choice(before, target, slope, window=WINDOW, eta=0.2, tau=0.1, gamma=GAMMA)
+    assert learner.update.tolist() == expected.tolist() and 1 < expected[0] < WINDOW
+    assert _window_ahead(Arm(update="bound"), np.ones((20, *SHAPE))) == WINDOW
 
 
 @pytest.mark.parametrize("setting", [DRIFTING, RANDOM[0]])
@@ -195,7 +209,7 @@ def test_shares_of_the_best_fixed_by_hand() -> None:
     """Two settings: 1 / 2 and 8 / 2 of the best fixed: the geometric mean is sqrt(0.5 x 4)."""
     fixed = {name: np.full(3, 2.0 + i) for i, name in enumerate(headline.FIXED)}
     results = {
-        setting: Found({**fixed, "a": np.full(3, value)}, {}, {}, {})
+        setting: Found({**fixed, "a": np.full(3, value)}, {}, {}, {}, {})
         for setting, value in ((DRIFTING, 1.0), (STATIONARY, 8.0))
     }
     assert of_best_fixed(results, "a") == pytest.approx((2**0.5,) * 3)
@@ -226,6 +240,7 @@ def _short(setting: Setting, seeds: range, arms: dict[str, Arm]) -> Found:
     return Found(
         {name: one.mean(0) for name, one in window.items()},
         window,
-        dict(zip(arms, update.mean(1).tolist(), strict=True)),
+        dict(zip(arms, update.mean((1, 2)).tolist(), strict=True)),
         {name: one[-1] for name, one in window.items()},
+        dict(zip(arms, update[:, -1].mean(1).tolist(), strict=True)),
     )
