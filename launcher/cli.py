@@ -47,6 +47,7 @@ COMMANDS = (
     Command("status", "launcher.control:status", "what each process of a run is doing"),
     Command("hold", "launcher.control:hold", "hold the policy of a running system"),
     Command("resume", "launcher.control:resume", "go on with the schedule after a hold"),
+    Command("schedule", "launcher.control:schedule", "change the schedule of a running learner"),
     Command("stop", "launcher.control:stop", "end a running system in order"),
     Command(
         "latency",
@@ -65,6 +66,7 @@ COMMANDS = (
     ),
     Command("report", "launcher.report:report", "a run's report again"),
     Command("view", "launcher.view:view", "open a run's recording in Rerun"),
+    Command("keys", "launcher.keys:keys", "make the certificates and keys for --link.secure"),
 )
 
 

@@ -1,11 +1,11 @@
-"""`tenuto status|hold|resume|stop`: orders to a system that runs."""
+"""`tenuto status|hold|resume|schedule|stop`: orders to a system that runs."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -18,18 +18,27 @@ from launcher.parsing import parse
 from launcher.run import RUNS
 from rtcore import channels
 from rtcore.bus import Bus, BusError, NoAnswerError
-from rtcore.config import ConfigError
+from rtcore.config import ConfigError, ScheduleConfig
+from rtcore.config_check import check
 from rtcore.messages import Command, CommandReply
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir, latest
 from rtcore.zenoh_bus import open_bus
 
-Verb = Literal["hold", "resume", "status", "stop"]
+Verb = Literal["hold", "resume", "status", "stop", "schedule"]
 
 
 @dataclass(frozen=True)
 class ControlOptions:
     """Which run."""
+
+    run_dir: Path | None = None
+    """The run directory. None: the newest one in runs/."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScheduleOptions(ScheduleConfig):
+    """Which run, and the schedule."""
 
     run_dir: Path | None = None
     """The run directory. None: the newest one in runs/."""
@@ -59,25 +68,46 @@ def status(argv: Sequence[str]) -> int:
 
 def hold(argv: Sequence[str]) -> int:
     """`tenuto hold`."""
-    return _order(argv, "hold", channels.LEARNER, "Hold the policy until `tenuto resume`; the critics go on.")
+    run_dir = _run_dir(argv, "hold", "Hold the policy until `tenuto resume`; the critics go on.")
+    return _order(run_dir, "hold", channels.LEARNER)
 
 
 def resume(argv: Sequence[str]) -> int:
     """`tenuto resume`."""
-    return _order(argv, "resume", channels.LEARNER, "Go on with the schedule after `tenuto hold`.")
+    run_dir = _run_dir(argv, "resume", "Go on with the schedule after `tenuto hold`.")
+    return _order(run_dir, "resume", channels.LEARNER)
+
+
+def schedule(argv: Sequence[str]) -> int:
+    """`tenuto schedule KIND`."""
+    argv = ["--kind", *argv] if argv and not argv[0].startswith("-") else argv
+    description = (
+        "Go by another schedule (KIND, first, or --kind) once the present window has ended; what is not "
+        "given stays as the run has it."
+    )
+    run_dir = _found(parse(ScheduleOptions, argv, prog="tenuto schedule", description=description).run_dir)
+    config = run_dir.config()
+    base = config.learner.schedule
+    shared = {one.name: getattr(base, one.name) for one in fields(ScheduleConfig)}
+    default = ScheduleOptions(run_dir=run_dir.path, **shared)
+    options = parse(ScheduleOptions, argv, prog="tenuto schedule", description=description, default=default)
+    wanted = ScheduleConfig(**{name: getattr(options, name) for name in shared})
+    check(
+        replace(config, learner=replace(config.learner, schedule=wanted))
+    )  # wrong input even if nothing runs
+    return _order(run_dir, "schedule", channels.LEARNER, wanted)
 
 
 def stop(argv: Sequence[str]) -> int:
     """`tenuto stop`."""
     description = "End the environment server in order; `tenuto run` then ends all the others."
-    return _order(argv, "stop", channels.ENV_SERVER, description)
+    return _order(_run_dir(argv, "stop", description), "stop", channels.ENV_SERVER)
 
 
-def _order(argv: Sequence[str], verb: Verb, process: str, description: str) -> int:
-    run_dir = _run_dir(argv, verb, description)
+def _order(run_dir: RunDir, verb: Verb, process: str, wanted: ScheduleConfig | None = None) -> int:
     with _joined(run_dir) as bus:
         try:
-            reply = _ask(bus, process, verb)
+            reply = _ask(bus, process, verb, wanted)
         except NoAnswerError as error:
             raise _silence(run_dir, process) from error
     if not reply.ok:
@@ -88,8 +118,12 @@ def _order(argv: Sequence[str], verb: Verb, process: str, description: str) -> i
 
 def _run_dir(argv: Sequence[str], command: str, description: str) -> RunDir:
     options = parse(ControlOptions, argv, prog=f"tenuto {command}", description=description)
-    if options.run_dir is not None:
-        return RunDir.open(options.run_dir)
+    return _found(options.run_dir)
+
+
+def _found(path: Path | None) -> RunDir:
+    if path is not None:
+        return RunDir.open(path)
     newest = latest(RUNS)
     if newest is None:
         raise ConfigError("run_dir", None, f"must be given: there is no run in {RUNS}/")
@@ -98,15 +132,23 @@ def _run_dir(argv: Sequence[str], command: str, description: str) -> RunDir:
 
 @contextmanager
 def _joined(run_dir: RunDir) -> Iterator[Bus]:
+    link = run_dir.config().link
     try:
-        with open_bus("client", run_dir.run_name, run_dir.socket_dir(), clock=MonotonicClock()) as bus:
+        with open_bus(
+            "client",
+            run_dir.run_name,
+            run_dir.socket_dir(),
+            clock=MonotonicClock(),
+            connect=link.connect,
+            secure=link.secure,
+        ) as bus:
             yield bus
     except BusError as error:
         raise CommandError(str(error)) from error
 
 
-def _ask(bus: Bus, process: str, verb: Verb) -> CommandReply:
-    return bus.ask(process, Command(id=uuid.uuid4().hex, verb=verb), timeout_s=1.0, tries=3)
+def _ask(bus: Bus, process: str, verb: Verb, wanted: ScheduleConfig | None = None) -> CommandReply:
+    return bus.ask(process, Command(id=uuid.uuid4().hex, verb=verb, schedule=wanted), timeout_s=1.0, tries=3)
 
 
 def _silence(run_dir: RunDir, process: str = "") -> CommandError:

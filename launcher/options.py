@@ -16,6 +16,7 @@ from tyro.conf import Positional, UseAppendAction
 from env_server.worlds import registry as worlds
 from launcher import presets
 from launcher.parsing import HELP_FLAGS, given, parse
+from learner.schedule.timetable import best
 from rtcore.config import (
     AgentConfig,
     ConfigError,
@@ -24,6 +25,7 @@ from rtcore.config import (
     LinkConfig,
     RecorderConfig,
     RunConfig,
+    SuperviseConfig,
 )
 from rtcore.config_check import check
 from rtcore.config_io import load_toml
@@ -53,6 +55,7 @@ class RunOptions:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     recorder: RecorderConfig = field(default_factory=RecorderConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
+    supervise: SuperviseConfig = field(default_factory=SuperviseConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,8 @@ class ProcessOptions(RunOptions):
     listen: Annotated[tuple[str, ...], UseAppendAction] = ()
     """A further endpoint to listen on; may be given several times."""
 
+
+SHORT = {"--learner.schedule": "--learner.schedule.kind"}  # what a section is mostly asked for by
 
 OptionsT = TypeVar("OptionsT", bound=RunOptions)
 
@@ -84,6 +89,7 @@ def read(
         ConfigError: anything about it is wrong. Nothing was created.
         SystemExit: help was printed.
     """
+    argv = [SHORT.get(token, token) for token in argv]
     wants_help = any(token in HELP_FLAGS for token in argv)
     plain = [token for token in argv if token not in HELP_FLAGS]
     try:
@@ -101,11 +107,19 @@ def _resolved(config: RunConfig) -> RunConfig:
     """Checked, with `hz` and `speed` both filled in."""
     worlds.require_fit(config.env, config.learner.algo)  # first: rules of an algorithm are beside the point
     check(config)
-    resolved = replace(config, env=worlds.resolve(config.env))
+    link = replace(config.link, secure=_absolute(config.link.secure))
+    resolved = replace(config, env=worlds.resolve(config.env), link=link)
     check(resolved)  # again, now that hz and speed are both known
+    if config.learner.schedule.kind == "optimal":
+        best(config.learner.schedule)
     if config.learner.algo == "rsac":
         worlds.require_speed(resolved.env, config.learner.reward)
     return resolved
+
+
+def _absolute(path: str) -> str:
+    """Processes, and commands about them, may start elsewhere."""
+    return str(Path(path).absolute()) if path else ""
 
 
 def describe(summary: str) -> str:
@@ -147,6 +161,7 @@ def _as_options(kind: type[OptionsT], base: RunConfig, argv: Sequence[str]) -> O
         learner=base.learner,
         recorder=base.recorder,
         link=base.link,
+        supervise=base.supervise,
     )
 
 
@@ -165,4 +180,5 @@ def _as_config(options: RunOptions, default: RunOptions, preset: str) -> RunConf
         learner=options.learner,
         recorder=recorder,
         link=options.link,
+        supervise=options.supervise,
     )

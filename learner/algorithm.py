@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from learner.checkpoint import State
 from learner.replay import Replay
+from learner.schedule.outlook import Outlook
 from rtcore.config import DEEP, TABULAR, ConfigError, LearnerConfig, RunConfig
 from rtcore.messages import Architecture
 from rtcore.spaces import Spaces
@@ -53,6 +54,14 @@ class Algorithm(Protocol):
 
     def begin_window(self, window: Window, unit: int) -> None:
         """Window m was entered in `unit`, which is t_m unless the learner came late."""
+
+    def outlook(self, start: int, length: int) -> Outlook | None:
+        """What can be foreseen of the window of `length` units that begins at t_m = `start`, to choose its
+        hold by. Call it after `end_unit(t_m - 1)`, before `begin_window`.
+
+        Returns:
+            None where the algorithm forecasts no Q, or has nothing to forecast from yet.
+        """
 
     def end_unit(self, unit: int) -> None:
         """Unit t ended. In the last unit of a window, call this before the next `begin_window`."""

@@ -6,6 +6,7 @@ is due for publication.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,7 +67,7 @@ class Conductor:
 
     def __init__(self, windows: WindowClock) -> None:
         self._windows = windows
-        self._shown: tuple[int, Phase] | None = None  # window and phase, as last announced
+        self._shown: tuple[Window, Phase] | None = None  # as last announced
         self._settled = (-1, 0)  # newest iterate that was due: (window, g)
         self._paused = False
         self._worked = False  # the policy was to be improved at some time of the present unit
@@ -93,40 +94,40 @@ class Conductor:
         self._worked |= self.improving
         return self._phase_change(run_time_ns, "operator")
 
-    def advance(self, run_time_ns: int, lead_ns: int) -> list[Happening]:
-        """Everything that happened since the last call, in order: after a stall, every unit by itself."""
-        found: list[Happening] = []
+    def advance(self, run_time_ns: int, lead_ns: int) -> Iterator[Happening]:
+        """Everything that happened since the last call, in order: after a stall, every unit by itself.
+
+        What a window will be is asked of the schedule only once all that happened before it has been
+        taken from the iterator: a schedule may decide by what was learned until then. Take everything.
+        """
         while self.position is not None and self.position.unit_end_ns <= run_time_ns:
-            found += self._enter(self.position.unit_end_ns)
+            yield from self._leave(self.position)
+            yield from self._enter(self.position.unit_end_ns)
         if self.position is None:
-            found += self._enter(run_time_ns)
+            yield from self._enter(run_time_ns)
         assert self.position is not None
         iterate = (self.position.window.m, self.position.iterate)
         if self.improving and iterate > self._settled and run_time_ns >= self.position.unit_end_ns - lead_ns:
             self._settled = iterate
-            found.append(PublishDue(*self._iterate(self.position)))
-        return found
+            yield PublishDue(*iterate_of(self.position))
 
-    def _enter(self, run_time_ns: int) -> list[Happening]:
+    def _leave(self, position: Position) -> Iterator[Happening]:
+        """The unit that `position` is in is over."""
+        yield UnitEnded(position.unit)
+        iterate = (position.window.m, position.iterate)
+        if position.phase == "update" and iterate > self._settled:
+            self._settled = iterate
+            if self._worked:  # a unit that an operator held throughout misses nothing
+                yield PublishMissed(*iterate_of(position))
+
+    def _enter(self, run_time_ns: int) -> Iterator[Happening]:
         """Go to the unit that `run_time_ns` is in: the one after the present one, or the first one."""
         previous, now = self.position, self._windows.position(run_time_ns)
         self.position = now
-        found: list[Happening] = []
-        if previous is not None:
-            found.append(UnitEnded(previous.unit))
-            iterate = (previous.window.m, previous.iterate)
-            if previous.phase == "update" and iterate > self._settled:
-                self._settled = iterate
-                if self._worked:  # a unit that an operator held throughout misses nothing
-                    found.append(PublishMissed(*self._iterate(previous)))
         self._worked = self.improving
         if previous is None or previous.window.m != now.window.m:
-            found.append(WindowEntered(now.window, now.unit))
-        return found + self._phase_change(run_time_ns, "operator" if self._paused else "schedule")
-
-    @staticmethod
-    def _iterate(position: Position) -> tuple[Window, int]:
-        return position.window, position.iterate
+            yield WindowEntered(now.window, now.unit)
+        yield from self._phase_change(run_time_ns, "operator" if self._paused else "schedule")
 
     def _phase_change(self, start_ns: int, reason: Literal["schedule", "operator"]) -> list[Happening]:
         if self.position is None:
@@ -134,8 +135,13 @@ class Conductor:
         phase: Phase = "hold" if self._paused else self.position.phase
         if phase == self.position.phase == "hold":
             reason = "schedule"  # an operator's order changes nothing here
-        shown = (self.position.window.m, phase)
+        shown = (self.position.window, phase)
         if shown == self._shown:
             return []
         self._shown = shown
         return [PhaseEntered(self.position.window, phase, start_ns, reason)]
+
+
+def iterate_of(position: Position) -> tuple[Window, int]:
+    """The window and g that `position` is in."""
+    return position.window, position.iterate

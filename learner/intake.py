@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
+from learner.diary import Diary
 from learner.replay import Replay
 from rtcore.bus import Bus
 from rtcore.ledger import Ledger
@@ -16,15 +17,16 @@ CAPACITY_BATCHES = 20_000  # at 20 a second, a quarter of an hour of a learner t
 
 
 class Intake:
-    """Feeds one environment's transitions to the replay.
+    """Feeds one environment's transitions to the replay, and its steps to the diary.
 
     Counts `received` (steps), `learned` (transitions in the replay), `duplicate`, `gaps` (steps that
     never came in time) and `broken` (steps that fit to no transition).
     """
 
-    def __init__(self, bus: Bus, env: str, ledger: Ledger) -> None:
+    def __init__(self, bus: Bus, env: str, ledger: Ledger, diary: Diary) -> None:
         self._log = LogReader(bus, env, capacity_batches=CAPACITY_BATCHES)
         self._ledger = ledger
+        self._diary = diary
         self._transitions = Transitions()
         self._replay: Replay | None = None
 
@@ -41,6 +43,7 @@ class Intake:
     def meet(self, spec: Spec, replay: Replay) -> None:
         """Learn the shapes and the action space; until then everything waits in the queue."""
         self._replay = replay
+        self._diary.meet(spec)
         self._dims = (spec.observation_dim, spec.action_dim)
         self._transitions = Transitions(*self._dims)
         low, high = np.asarray(spec.action_low), np.asarray(spec.action_high)
@@ -75,6 +78,7 @@ class Intake:
         if self._replay is not None:
             self._learn(self._replay, self._log.finish())
             self._replay.flush()
+            self._diary.finish()
 
     def _learn(self, replay: Replay, steps: list[Step]) -> int:
         if not steps:
@@ -91,6 +95,7 @@ class Intake:
                     transition.terminated,
                     transition.unit,
                 )
+        self._diary.acted(steps)
         self._account()
         return self._transitions.transitions - before
 

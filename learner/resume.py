@@ -9,6 +9,7 @@ from rtcore.run_dir import RunDir
 
 CHECKPOINT_DIR = "checkpoint"  # in the learner's directory, as are the others
 REPLAY_DIR = "replay"
+SCHEDULE_FILE = "schedule.json"
 PLACE = "intake"  # the checkpoint's scalar that says where in the log it was made
 
 
@@ -39,3 +40,11 @@ def last_published(run_dir: RunDir) -> int:
     """Version of the newest policy that was published in this run; 0 if none was."""
     policy = run_dir.read_policy()
     return 0 if policy is None else policy.version
+
+
+def timetable(run_dir: RunDir) -> bytes | None:
+    """The timetable that an earlier learner of the run kept; None if its configuration says it all."""
+    try:
+        return (run_dir.learner_dir / SCHEDULE_FILE).read_bytes()
+    except FileNotFoundError:
+        return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Iterable
 from typing import assert_never
 
 from learner import resume
@@ -23,10 +24,12 @@ from learner.conductor import (
     WindowEntered,
 )
 from learner.intake import Intake
+from learner.orders import Orders
 from learner.outbox import Outbox
 from learner.power import Levers, PowerControl
 from learner.publication import Publication
 from learner.replay import open_replay
+from learner.schedule.scheduler import Scheduler
 from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.clock import Clock
@@ -35,8 +38,8 @@ from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.messages import Command, CommandReply, Phase, Spec, WindowNotice
 from rtcore.run_dir import RunDir
+from rtcore.signing import Signer
 from rtcore.spaces import Spaces
-from rtcore.windows import WindowClock, make_schedule
 
 IDLE_WAIT_S = 0.02  # nothing to learn from: wait so long for the next batch (they come every 50 ms)
 DRAIN_LIMIT_S = 2.0  # after the stop: wait so long for the env server's last batch
@@ -58,6 +61,7 @@ class LearnerService:
         ledger: Ledger,
         *,
         levers: Levers | None = None,
+        signer: Signer | None = None,
     ) -> None:
         """`levers`: for the governor; None, as in virtual time: it does not govern."""
         self._config = config
@@ -65,15 +69,16 @@ class LearnerService:
         self._clock = clock
         self._ledger = ledger
         self._specs = bus.latest(channels.SPEC, config.env.name)
-        self._intake = Intake(bus, config.env.name, ledger)
-        self.outbox = Outbox(bus, run_dir, clock, ledger)
-        self._windows = WindowClock(make_schedule(config.learner.schedule), round(config.env.unit_s * 1e9))
-        self._conductor = Conductor(self._windows)
+        self.outbox = Outbox(bus, run_dir, clock, ledger, signer)
+        self._intake = Intake(bus, config.env.name, ledger, self.outbox.diary)
+        kept = run_dir.learner_dir / resume.SCHEDULE_FILE
+        self._scheduler = Scheduler(config, clock, ledger, lambda data: self.outbox.keep(kept, data))
+        self._conductor = Conductor(self._scheduler.windows)
+        self._orders = Orders(self._conductor, self._scheduler, clock, ledger)
         self._budget = (TableBudget if config.learner.algo in TABULAR else UpdateBudget)(config.learner)
         self._power = PowerControl(config.learner, levers, ledger)
         self._notices: list[WindowNotice] = []
         self._publication = Publication(config.learner.algo, self._notices, self.outbox, ledger)
-        self._orders: list[str] = []  # from the bus's thread; carried out between two steps
         self._spec: Spec | None = None
         self._on_time = False  # the learner was there before T0: the first window begins on the dot
         self._algorithm: Algorithm | None = None
@@ -84,6 +89,7 @@ class LearnerService:
     def run(self, stop: Stop) -> None:
         """Learn until stopped, then take what the env server still sends."""
         while not stop.is_set():
+            self._ledger.beat(self._clock.now_ns())
             if self._spec is None:
                 stop.wait(IDLE_WAIT_S)  # the log may be there already, and would not let us wait
                 self.step()
@@ -121,11 +127,7 @@ class LearnerService:
         """Answer an operator; called on the bus's thread."""
         if command.verb == "status":
             return CommandReply(id=command.id, ok=True, text=self._describe())
-        if command.verb in ("hold", "resume"):
-            self._orders.append(command.verb)
-            done = "the policy will be held" if command.verb == "hold" else "the schedule will go on"
-            return CommandReply(id=command.id, ok=True, text=done)
-        return CommandReply(id=command.id, ok=False, text=f"the learner knows no '{command.verb}'")
+        return self._orders.take(command)
 
     def close(self) -> None:
         """Account for what never came, and write the checkpoint."""
@@ -178,6 +180,7 @@ class LearnerService:
         self._algorithm = make_algorithm(self._config, Spaces.of(spec), seed, replay)
         version = resume.last_published(self._run_dir)
         self._publication.go_on_from(version)
+        self._scheduler.meet(self._algorithm, resume.timetable(self._run_dir))
         if resume.restore(self._run_dir, self._algorithm, self._intake):
             self._budget.resume(len(replay))
             text = f"goes on from the checkpoint: policy {version}, {len(replay)} transitions in the replay"
@@ -190,24 +193,20 @@ class LearnerService:
             self._on_time = True
             return
         lead_ns = min(max(self._lead_ns, spec.tick_ns), spec.unit_ns)
-        happenings = self._conductor.advance(0, 0) if self._on_time else []
-        self._on_time = False
-        happenings += self._conductor.advance(run_ns, lead_ns)
-        while self._orders:
-            happenings += self._obey(self._orders.pop(0), now_ns, run_ns)
-        for happening in happenings:
-            self._handle(happening, spec)
+        if self._on_time:
+            self._on_time = False
+            self._handle_all(self._conductor.advance(0, 0), spec)
+        self._handle_all(self._conductor.advance(run_ns, lead_ns), spec)
+        self._handle_all(self._orders.carry_out(spec.t0_ns), spec)
         if now_ns >= self._metrics_due_ns and self._algorithm is not None:
             self._metrics_due_ns = now_ns + METRICS_PERIOD_NS
             self._ledger_metrics(self._algorithm)
             self._ledger_rate(now_ns)
 
-    def _obey(self, order: str, now_ns: int, run_ns: int) -> list[Happening]:
-        self._ledger.event(now_ns, "INFO", f"operator: {order}")
-        if order == "resume":
-            return self._conductor.resume(run_ns)
-        self._ledger.count("operator_holds")
-        return self._conductor.pause(run_ns)
+    def _handle_all(self, happenings: Iterable[Happening], spec: Spec) -> None:
+        """Each in its turn: what comes next may follow from it."""
+        for happening in happenings:
+            self._handle(happening, spec)
 
     def _handle(self, happening: Happening, spec: Spec) -> None:
         assert self._algorithm is not None
@@ -216,19 +215,26 @@ class LearnerService:
                 self._algorithm.end_unit(unit)
             case WindowEntered(window, unit):
                 self._algorithm.begin_window(window, unit)
+                self.outbox.diary.window(window, unit, self._algorithm)
+                self._scheduler.entered(window)
             case PhaseEntered():
                 self._announce(happening, spec)
-            case PublishDue(window, iterate) if not self._conductor.improving:  # held in the same turn
-                self._publication.withhold(window.m, iterate, self._clock.now_ns())
-            case PublishDue(_, iterate):
-                self._iterate(self._algorithm, iterate)
-                self._publication.publish(self._algorithm, happening, spec, self._clock, self._windows)
+            case PublishDue():
+                self._handle_all(self._orders.carry_out(spec.t0_ns), spec)  # what came before comes first
+                self._publish(happening, spec, self._algorithm)
             case PublishMissed(window, iterate):
                 if not self._conductor.paused:
                     self._iterate(self._algorithm, iterate)
                 self._publication.withhold(window.m, iterate, self._clock.now_ns())
             case _:
                 assert_never(happening)
+
+    def _publish(self, due: PublishDue, spec: Spec, algorithm: Algorithm) -> None:
+        if self._conductor.improving:
+            self._iterate(algorithm, due.iterate)
+            self._publication.publish(algorithm, due, spec, self._clock, self._scheduler.windows)
+        else:
+            self._publication.withhold(due.window.m, due.iterate, self._clock.now_ns())
 
     def _iterate(self, algorithm: Algorithm, g: int) -> None:
         before = algorithm.policy_steps

@@ -54,10 +54,22 @@ def _schedule(schedule: ScheduleConfig) -> str:
             return f"fixed: windows of {length}, {share if _holds(schedule) else 'without a hold'}"
         case "explicit":
             return f"explicit: starts {list(schedule.t_m)}, updates {list(schedule.g_m)} units"
+        case "live":
+            return "live: a window of 1 unit after the other, without a hold"
+        case "optimal":
+            return f"optimal: windows of {schedule.l_f} units, held as the bound of given constants has it"
+        case "auto":
+            return f"auto: windows of {schedule.l_f} units, held as forecasts predict it to pay"
+        case "auto_bound":
+            return f"auto_bound: windows of {schedule.l_f} units, held as the bound of live estimates has it"
 
 
 def _holds(schedule: ScheduleConfig) -> bool:
-    return schedule.kind != "fixed" or (schedule.gamma_f < 1 and schedule.l_f > 1)
+    match schedule.kind:
+        case "fixed":
+            return schedule.gamma_f < 1 and schedule.l_f > 1
+        case kind:
+            return kind != "live"
 
 
 def _hold(learner: LearnerConfig, who: str) -> list[Row]:

@@ -10,17 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 DriftKind = Literal[
-    "none",
-    "constant",
-    "sine",
-    "ramp",
-    "square",
-    "switch",
-    "random_walk",
-    "ou",
-    "noise",
-    "burst",
-    "recorded",
+    "none", "constant", "sine", "ramp", "square", "switch", "random_walk", "ou", "noise", "burst", "recorded"
 ]
 Notify = Literal["none", "changed", "value"]
 Algo = Literal["sac", "fsac", "rsac", "q", "fq", "npg", "tempo"]
@@ -28,7 +18,7 @@ TABULAR: tuple[Algo, ...] = ("q", "fq", "npg", "tempo")  # for finite worlds
 DEEP: tuple[Algo, ...] = ("sac", "fsac", "rsac")  # for continuous ones
 Basis = Literal["constant", "identity", "polynomial", "fourier"]
 MissPolicy = Literal["hold", "neutral", "hold_then_neutral"]
-ScheduleKind = Literal["fixed", "explicit"]
+ScheduleKind = Literal["fixed", "explicit", "optimal", "auto", "auto_bound", "live"]
 Rounding = Literal["floor", "ceil", "paper_le"]
 Precision = Literal["float32", "bfloat16", "auto"]
 
@@ -142,15 +132,34 @@ class AgentConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BoundConfig:
+    """The constants of the paper's bound (section 5), for the optimal schedule; `tenuto plan` finds them."""
+
+    c_1: float = 1.0  # C_1, the policy's distance from the optimal one as a window begins
+    c_45: float = 1.0  # C_4 + C_5, what a change of the world costs
+    eta: float = 0.1  # step size and
+    tau: float = 0.1  # entropy weight of the policy's update
+    alpha_1: float = 1.0  # growth of the variation budget per unit, in the update
+    alpha_2: float = 1.0  # and in the hold
+    b_1: float = 1.0  # B^max of the update
+    b_2: float = 1.0  # and of the hold
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScheduleConfig:
     """When the policy is updated and when it is held (paper, section 3)."""
 
     kind: ScheduleKind = "fixed"
-    l_f: int = 10  # units per window, fixed schedule
-    gamma_f: float = 0.7  # share of a window in which the policy is updated
+    l_f: int = 10  # units per window; live: 1 whatever is given here
+    gamma_f: float = 0.7  # share of a window that is updated in; auto: while too little is known
     rounding: Rounding = "floor"
     t_m: tuple[int, ...] = ()  # window starts in units, explicit schedule; the first is 0
     g_m: tuple[int, ...] = ()  # update units of each, explicit schedule
+    least_update: int = 1  # auto, auto_bound: units of a window that are updated in whatever is predicted
+    least_gain: float = 0.05  # auto: hold only if that is predicted to save this share of the regret;
+    # docs/headline.md has how it was picked
+    rate: float = 0.1  # auto with fsac: share of the way to its target that a unit takes the policy
+    bound: BoundConfig = field(default_factory=BoundConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +231,8 @@ class LearnerConfig:
     threads: int = 1
     precision: Precision = "auto"  # of the networks' products, "auto": bfloat16 where the processor has it
     governor: Literal["on", "off"] = "on"  # give way to the agent before deadlines are missed
+    checkpoint_s: float = 10.0  # between checkpoints, each at a unit's end; what a kill -9 loses at most
+    on_mismatch: Literal["refuse", "fresh"] = "refuse"  # a checkpoint that does not fit: end, or set it aside
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     forecast: ForecastConfig = field(default_factory=ForecastConfig)
     reward: RewardModelConfig = field(default_factory=RewardModelConfig)
@@ -244,6 +255,18 @@ class LinkConfig:
 
     connect: tuple[str, ...] = ()  # extra endpoints to connect to
     listen: tuple[str, ...] = ()  # extra endpoints to listen on
+    secure: str = ""  # directory of this host's keys and certificates; "": nothing is secured
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuperviseConfig:
+    """When a process that died is started again."""
+
+    limit: int = 10  # deaths of one process within `within_s` after which the run is given up
+    within_s: float = 60.0
+    first_s: float = 0.1  # from a death to the next start, then twice as long each time
+    most_s: float = 5.0  # at most
+    stuck_s: float = 8.0  # a process whose loop has not turned for so long is killed and started again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,6 +281,7 @@ class RunConfig:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     recorder: RecorderConfig = field(default_factory=RecorderConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
+    supervise: SuperviseConfig = field(default_factory=SuperviseConfig)
 
 
 class ConfigError(ValueError):

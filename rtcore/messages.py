@@ -11,6 +11,8 @@ from typing import Annotated, Literal, get_args
 
 import msgspec
 
+from rtcore.config import ScheduleConfig
+
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Nanos = Annotated[int, msgspec.Meta(ge=0)]
 Index = Annotated[int, msgspec.Meta(ge=-1)]  # -1 means "none"
@@ -44,8 +46,8 @@ class Spec(Message, frozen=True, kw_only=True):
 
     env: str
     env_id: str
-    incarnation: Nanos  # the env server's start: differs after every restart
-    t0_ns: Nanos  # deadline of tick 0
+    incarnation: Nanos  # of the env server: greater after every restart
+    t0_ns: int  # deadline of tick 0; below 0 if the host was started anew since
     wall_t0_ns: Nanos  # Unix time at t0_ns, for the `wall` timeline alone
     tick_ns: Annotated[int, msgspec.Meta(gt=0)]
     unit_ns: Annotated[int, msgspec.Meta(gt=0)]
@@ -59,6 +61,7 @@ class Spec(Message, frozen=True, kw_only=True):
     # A finite world has numbered states and actions: an observation is the state's number, an action its own.
     states: Count = 0  # 0: observations are continuous
     actions: Count = 0  # 0: actions are continuous
+    host: str = ""  # the boot whose monotonic clock the stamps are of (`rtcore.epoch.this_boot`)
 
 
 class Step(Message, frozen=True, kw_only=True):
@@ -154,6 +157,7 @@ class Policy(Message, frozen=True, kw_only=True):
     weights: bytes  # safetensors, float32
     sha256: str  # hex digest of `weights`
     created_ns: Nanos
+    signature: bytes = b""  # of all the others, by the learner's key; empty: not signed
 
 
 class WindowNotice(Message, frozen=True, kw_only=True):
@@ -164,7 +168,7 @@ class WindowNotice(Message, frozen=True, kw_only=True):
     update_units: Count
     hold_units: Count | None  # None: held for good
     phase: Phase
-    at_ns: Nanos  # stamp of the phase's start
+    at_ns: int  # stamp of the phase's start; see `Spec.t0_ns`
     reason: Literal["schedule", "operator"] = "schedule"
 
 
@@ -202,13 +206,15 @@ class Stats(Message, frozen=True, kw_only=True):
     events: list[Event] = []  # of the last 10 s and since the previous message; so they repeat
     returns: list[EpisodeReturn] = []  # the newest ones; repeated, so that a lost message loses none
     windows: list[WindowNotice] = []  # the learner's phases so far
+    beat_ns: Nanos = 0  # when the process's own loop last turned; 0: not yet
 
 
 class Command(Message, frozen=True, kw_only=True):
     """An operator's order to one process. Repeating an `id` repeats the reply, not the deed."""
 
     id: str
-    verb: Literal["hold", "resume", "status", "stop"]
+    verb: Literal["hold", "resume", "status", "stop", "schedule"]
+    schedule: ScheduleConfig | None = None  # to go by, of the verb of that name
 
 
 class CommandReply(Message, frozen=True, kw_only=True):

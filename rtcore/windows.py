@@ -126,16 +126,19 @@ class ExplicitSchedule:
 
 
 def make_schedule(config: ScheduleConfig) -> Schedule:
-    """The schedule that the section `learner.schedule` describes.
+    """The schedule that the section `learner.schedule` declares; of a kind whose windows the learner
+    decides about, the fixed one that they fall back to.
 
     Raises:
-        ConfigError: it describes none.
+        ConfigError: it declares none.
     """
     match config.kind:
-        case "fixed":
-            return FixedSchedule(config.l_f, config.gamma_f, config.rounding)
         case "explicit":
             return ExplicitSchedule(config.t_m, config.g_m)
+        case "live":
+            return FixedSchedule(1, 1.0)
+        case "fixed" | "optimal" | "auto" | "auto_bound":
+            return FixedSchedule(config.l_f, config.gamma_f, config.rounding)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,11 @@ from learner.deep.sac import Sac
 from learner.forecast.forq import fit, horizon
 from learner.forecast.judge import Judge
 from learner.replay import Replay
+from learner.schedule.outlook import Outlook
 from rtcore.config import LearnerConfig
 from rtcore.windows import Window
+
+CANDIDATES = 16  # actions in each state that a window's hold is chosen by
 
 
 class Fsac(Sac):
@@ -95,6 +98,41 @@ class Fsac(Sac):
         if self._distilled is not None:
             critics = [snapshot.parameters for snapshot in snapshots]
             self._distilled.restart(forecast.weights, critics)
+
+    def outlook(self, start: int, length: int) -> Outlook | None:
+        """See `Algorithm`: on a batch of the replay, with `CANDIDATES` of the policy's actions in each state.
+
+        Experimental: SAC's policy is taken to go towards exp(Qtilde / alpha) as a table's would, by
+        schedule.rate of the way in a unit, and the best action is the best of the candidates. They are
+        drawn from the policy, so a density f becomes f / pi on them.
+        """
+        snapshots = self._history.snapshots
+        if not snapshots or not len(self._replay):
+            return None
+        self._draw_batch("judge")
+        observation = self._sampled.observation
+        drawn = [self._propose(self._now, observation, "judge") for _ in range(CANDIDATES)]
+        nets = [*(snapshot.net for snapshot in snapshots), self._critic_net]
+        values = [
+            [smaller(self._evaluate(net, observation, one.action)).double().numpy() for one in drawn]
+            for net in nets
+        ]
+        q = np.stack(values).swapaxes(1, 2)  # [l + 1, states, candidates]
+        past, plain, share = q[:-1], q[-1], self._judge.share
+        config, times = self._config.forecast, [float(snapshot.time - start) for snapshot in snapshots]
+        ahead = horizon(config, Window(0, start, length, 0), self._replay_age(start))
+        weights = np.stack([fit(config, times, unit) for unit in (*range(length + 1), ahead)])
+        forecasts = share * np.tensordot(weights, past, 1) + (1.0 - share) * plain
+        density = np.stack([one.log_prob.double() for one in drawn], -1)
+        return Outlook(
+            past=past,
+            times=np.array(times),
+            forecasts=forecasts[:-1],
+            target=forecasts[-1] - self._temperature.value * density,
+            log_policy=np.full(plain.shape, -np.log(CANDIDATES)),
+            rate=self._config.schedule.rate,
+            temperature=self._temperature.value,
+        )
 
     def _replay_age(self, unit: int) -> float:
         """Mean age in units, at the start of `unit`, of the transitions that the critics learn from."""

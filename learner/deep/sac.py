@@ -34,6 +34,7 @@ from learner.deep.temperature import Temperature
 from learner.deep.tensors import BatchTensors
 from learner.deep.value_network import ValueNetwork
 from learner.replay import Replay, make_batch
+from learner.schedule.outlook import Outlook
 from rtcore.config import LearnerConfig
 from rtcore.messages import Architecture
 from rtcore.windows import Window
@@ -228,6 +229,10 @@ class Sac(Durable):
 
     def begin_window(self, window: Window, unit: int) -> None:
         """SAC makes no forecast."""
+
+    def outlook(self, start: int, length: int) -> Outlook | None:  # noqa: ARG002 (for subclasses)
+        """SAC foresees nothing."""
+        return None
 
     def end_unit(self, unit: int) -> None:
         """SAC keeps no past critics."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,17 @@ class Forecast:
     judged: Table
     known: Table
     value: Table
+
+
+class Foreseen(NamedTuple):
+    """Past tables, [l, S, A], at times [l] in units relative to t_m; Q in the units t_m .. t_{m+1},
+    [W + 1, S, A], and at the horizon of the forecast that the policy will be improved towards, [S, A].
+    """
+
+    times: NDArray[np.float64]
+    past: Table
+    forecasts: Table
+    target: Table
 
 
 class Forecaster:
@@ -95,6 +106,20 @@ class Forecaster:
         if end is not None and end != window.start + ahead:
             judged = np.tensordot(forq.fit(self._config, times, end - window.start), tables, 1)
         return Forecast(window, ahead, tuple(weights.tolist()), judged, known, forecast)
+
+    def foresee(self, window: Window, plain: Table, age_units: float) -> Foreseen | None:
+        """What `trusted` would be with forecasts of every unit of a window that begins now, with `plain` for
+        Q at t_m; None without a past table.
+        """
+        if not self._history:
+            return None
+        times = [float(time - window.start) for time in self._history]
+        past, share = np.stack(list(self._history.values())), self._judge.share
+        assert window.end is not None, "a window without end cannot be foreseen"
+        ahead = [*range(window.end - window.start + 1), forq.horizon(self._config, window, age_units)]
+        weights = np.stack([forq.fit(self._config, times, unit) for unit in ahead])
+        tables = share * np.tensordot(weights, past, 1) + (1.0 - share) * plain
+        return Foreseen(np.array(times), past, tables[:-1], tables[-1])
 
     @property
     def alone(self) -> bool:

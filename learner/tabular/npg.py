@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,12 @@ from numpy.typing import NDArray
 
 from learner.checkpoint import State
 from learner.replay import Replay
+from learner.schedule.outlook import Outlook
 from learner.tabular.fq import ForecastingQ
 from learner.tabular.table import Table, mix, npg_step
 from rtcore.config import LearnerConfig
 from rtcore.spaces import Spaces
+from rtcore.windows import Window
 
 
 class Npg(ForecastingQ):
@@ -33,14 +36,52 @@ class Npg(ForecastingQ):
         super().__init__(config, spaces, seed, replay)
         self._log_policy: Table = np.full(self._q.shape, -np.log(spaces.actions))
         self._newest = 0  # iterate of this window that was made last
+        self._seen = math.nan  # regret that the tables of this window have shown so far
+        self._realised = math.nan  # of the window before, whole
 
     def update(self, *, improve_policy: bool) -> None:
         """Learn Q from the transitions not read yet; the policy is improved by `iterate` alone."""
         del improve_policy
         super().update(improve_policy=False)
 
+    def begin_window(self, window: Window, unit: int) -> None:
+        """See `ForecastingQ`."""
+        super().begin_window(window, unit)
+        if unit != window.start:
+            self._seen = math.nan  # what is seen now is not the whole window's
+
     def _forecast_made(self) -> None:
         self._newest = 0
+        self._realised, self._seen = self._seen, self._regret_now()
+
+    def outlook(self, start: int, length: int) -> Outlook | None:
+        """The closed form of what `iterate` would make of a window, and the forecasts for its units."""
+        window = Window(0, start, length, 0)
+        foreseen = self._forecaster.foresee(window, self._q, self._age_units(start))
+        if foreseen is None:
+            return None
+        table = self._config.table
+        return Outlook(
+            past=foreseen.past,
+            times=foreseen.times,
+            forecasts=foreseen.forecasts,
+            target=foreseen.target,
+            log_policy=self._log_policy.copy(),
+            rate=min(1.0, table.eta * table.entropy / (1.0 - self._config.gamma)),
+            temperature=table.entropy,
+        )
+
+    def end_unit(self, unit: int) -> None:
+        """Unit t ended: keep a copy of the table, and note what regret it shows for the policy."""
+        super().end_unit(unit)
+        self._seen += self._regret_now()
+
+    def _regret_now(self) -> float:
+        """Mean over the states of max_a Q(s, a) - sum_a pi(a|s) Q(s, a): one unit's share of what the
+        schedule `auto` predicts for a window, with the table itself for the forecast of it.
+        """
+        lost = self._q.max(-1) - (np.exp(self._log_policy) * self._q).sum(-1)
+        return float(lost.mean())
 
     def iterate(self, g: int) -> bool:
         """One iteration of the policy, unless this iterate was made before; says whether it was not.
@@ -62,6 +103,20 @@ class Npg(ForecastingQ):
         self.policy_steps += 1
         return True
 
+    def metrics(self) -> dict[str, float]:
+        """Those of `ForecastingQ`; schedule/realised: regret of the last window, by the tables that came, in
+        the units of what the schedule `auto` predicted for it.
+        """
+        found = super().metrics()
+        return found if math.isnan(self._realised) else found | {"schedule/realised": self._realised}
+
+    def window_start(self) -> tuple[Table, Table] | None:
+        """Qtilde as the iterations use it, and log pi as it is now; None before the first window."""
+        made = self._forecaster.made
+        if made is None:
+            return None
+        return self._forecaster.trusted(made.known).copy(), self._log_policy.copy()
+
     def _policy(self) -> Table:
         return mix(np.exp(self._log_policy), self._config.table.epsilon)
 
@@ -70,7 +125,9 @@ class Npg(ForecastingQ):
     def state(self) -> State:
         """That of `ForecastingQ`, with how far the window's iterations are."""
         base = super().state()
-        return State(base.tensors, base.scalars | {"newest": self._newest})
+        found = {"seen": self._seen, "realised": self._realised}
+        regret = {name: None if math.isnan(value) else value for name, value in found.items()}
+        return State(base.tensors, base.scalars | {"newest": self._newest} | regret)
 
     def load(self, state: State) -> None:
         """Go on from `state`.
@@ -80,6 +137,8 @@ class Npg(ForecastingQ):
         """
         super().load(state)
         self._newest = int(state.scalars["newest"])
+        found = (state.scalars[name] for name in ("seen", "realised"))
+        self._seen, self._realised = (math.nan if one is None else float(one) for one in found)
 
     def _tables(self) -> dict[str, NDArray[Any]]:
         return super()._tables() | {"log_policy": self._log_policy}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from learner.checkpoint import CheckpointError, State, require_fit
 from learner.replay import Columns, Replay
+from learner.schedule.outlook import Outlook
 from learner.tabular.table import Table, epsilon_greedy, q_update
 from rtcore.config import LearnerConfig
 from rtcore.messages import Architecture
@@ -117,6 +118,10 @@ class QLearning:
 
     def begin_window(self, window: Window, unit: int) -> None:
         """Q-learning makes no forecast."""
+
+    def outlook(self, start: int, length: int) -> Outlook | None:  # noqa: ARG002 (for subclasses)
+        """Q-learning foresees nothing."""
+        return None
 
     def end_unit(self, unit: int) -> None:
         """Q-learning keeps no past tables."""

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from learner.checkpoint import State, require_fit
 from learner.replay import Replay
+from learner.schedule.outlook import Outlook
 from learner.tabular.q import SAME, entropy, table_architecture
 from learner.tabular.table import Table
 from rtcore.config import ConfigError, LearnerConfig
@@ -64,6 +65,10 @@ class Tempo:
         """Remember t_m."""
         del unit
         self._start = window.start
+
+    def outlook(self, start: int, length: int) -> Outlook | None:  # noqa: ARG002 (the protocol's signature)
+        """Nothing is foreseen."""
+        return None
 
     def end_unit(self, unit: int) -> None:
         """Only iterates move beta: in a hold it stays as it is."""

@@ -8,7 +8,7 @@ import pytest
 from env_server.worlds.registry import resolve
 from launcher import options, presets
 from launcher.options import ProcessOptions, RunOptions, read
-from rtcore.config import ConfigError, RunConfig
+from rtcore.config import ConfigError, RunConfig, SuperviseConfig
 from rtcore.config_check import check
 from rtcore.config_io import dump_toml
 from rtcore.run_dir import RunDir
@@ -134,3 +134,8 @@ def test_a_unit_shorter_than_the_derived_tick_is_refused() -> None:
 
 def test_the_description_names_the_presets() -> None:
     assert options.describe("X.").startswith("X. PRESET is one of halfcheetah, bandit")
+
+
+def test_supervision_is_set_on_the_command_line() -> None:
+    supervise = config_of("pointmass", "--supervise.limit", "3", "--supervise.most-s", "2").supervise
+    assert supervise == SuperviseConfig(limit=3, most_s=2.0)

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcore.config import ConfigError, RunConfig
-from rtcore.config_check import RULES, check, check_unit, rule_for
+from rtcore.config import ConfigError, ForecastConfig, LearnerConfig, RunConfig, ScheduleConfig
+from rtcore.config_check import check, check_unit
+from rtcore.config_rules import RULES, rule_for
 
 INF, NAN = float("inf"), float("nan")
 
@@ -59,7 +60,7 @@ def test_no_field_takes_anything() -> None:
         ("learner.schedule.gamma_f", True, "must be in (0, 1]"),
         ("learner.schedule.l_f", 0, "must be an integer in 1..1000000000"),
         ("learner.schedule.l_f", 10.0, "must be an integer in 1..1000000000"),
-        ("learner.schedule.kind", "live", "must be one of 'fixed', 'explicit'"),
+        ("learner.schedule.kind", "daily", None),
         ("learner.schedule.rounding", "round", "must be one of 'floor', 'ceil', 'paper_le'"),
         ("learner.schedule.t_m", (0, 1.5), "each entry must be an integer in 0..1000000000"),
         ("learner.schedule.t_m", [0], "each entry must be an integer in 0..1000000000"),
@@ -141,6 +142,10 @@ def test_no_field_takes_anything() -> None:
         ("recorder.port", 65_536, "must be an integer in 1..65535"),
         ("link.connect", ("localhost",), "each entry must be protocol/address, like tls/192.0.2.1:7447"),
         ("link.listen", ("http/x:1",), "each entry must be protocol/address, like tls/192.0.2.1:7447"),
+        ("learner.checkpoint_s", 0.0, "must be in (0, 1e9]"),
+        ("supervise.first_s", -0.1, "must be in [0, 1e9]"),
+        ("supervise.first_s", 5.1, "must be <= supervise.most_s, which is 5"),
+        ("supervise.stuck_s", 0.5, "must be in [1, 1e9]"),
     ],
 )
 def test_what_is_out_of_range_is_named(name: str, value: object, allowed: str | None) -> None:
@@ -262,3 +267,33 @@ def test_a_drift_is_consistent(name: str) -> None:
     for field, value in [*burst, (f"{name}.every", 3.5), (f"{name}.low", 1.0), (f"{name}.high", 1.0)]:
         config = replaced(config, field, value)
     check(config)
+
+
+@pytest.mark.parametrize(
+    ("learner", "message"),
+    [
+        ({"algo": "q"}, "learner.schedule.kind = 'auto': must go with learner.algo npg or fsac"),
+        ({"algo": "rsac"}, "learner.schedule.kind = 'auto': must go with learner.algo npg or fsac"),
+        (
+            {"algo": "npg", "forecast": ForecastConfig(kind="none")},
+            "learner.schedule.kind = 'auto': must have a forecast to choose by",
+        ),
+        (
+            {"algo": "fsac", "forecast": ForecastConfig(parity="authors")},
+            "learner.schedule.kind = 'auto': must have a forecast to choose by",
+        ),
+        (
+            {"algo": "npg", "schedule": ScheduleConfig(kind="auto", l_f=3, least_update=4)},
+            "learner.schedule.least_update = 4: must be <= learner.schedule.l_f, which is 3",
+        ),
+        (
+            {"algo": "fsac", "schedule": ScheduleConfig(kind="auto_bound")},
+            "learner.schedule.kind = 'auto_bound': must go with learner.algo npg,",
+        ),
+    ],
+)
+def test_a_schedule_that_chooses_has_something_to_choose_by(learner: dict[str, Any], message: str) -> None:
+    fields: dict[str, Any] = {"schedule": ScheduleConfig(kind="auto")} | learner
+    with pytest.raises(ConfigError) as error:
+        check(RunConfig(learner=LearnerConfig(**fields)))
+    assert str(error.value).startswith(message)

@@ -126,7 +126,7 @@ def test_an_integer_does_for_a_number(tmp_path: Path) -> None:
         ),
         (
             '[link]\n"con\\nnect" = []',
-            "link.con\\nnect = []: unknown key; allowed here: connect, listen",
+            "link.con\\nnect = []: unknown key; allowed here: connect, listen, secure",
         ),
     ],
 )
