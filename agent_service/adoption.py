@@ -6,6 +6,7 @@ Runs beside acting, never in it: the acting thread only takes a reference (`take
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from agent_service.inference import ActingPolicy, Array, TanhGaussianPolicy
 from agent_service.tables import CategoricalPolicy
 from rtcore.ledger import Ledger
 from rtcore.messages import Policy, Spec
+from rtcore.signing import NoVerifier, Verifier
 from rtcore.spaces import Spaces
 from rtcore.weights import WeightsError, verify
 
@@ -24,7 +26,16 @@ class Adoption:
     a repeat of the newest version, which a late or reconnected reader gets, counts as `.repeated` alone.
     """
 
-    def __init__(self, spec: Spec, ledger: Ledger) -> None:
+    def __init__(
+        self,
+        spec: Spec,
+        ledger: Ledger,
+        verifier: Verifier | None = None,
+        keep: Callable[[Policy], None] | None = None,
+    ) -> None:
+        """`verifier` checks who signed a policy, None: nobody does; `keep` is given each good new one."""
+        self._keep = keep
+        self._verifier = verifier or NoVerifier()
         self._spaces = Spaces.of(spec)
         self._ledger = ledger
         self._low: Array = np.asarray(spec.action_low, np.float32)
@@ -49,6 +60,8 @@ class Adoption:
         if self.take() is not None:
             self._ledger.count("policies.superseded")
         self._ready.append((ready, policy))
+        if self._keep is not None:
+            self._keep(policy)
 
     def take(self) -> tuple[ActingPolicy, Policy] | None:
         """The policy that is ready for the swap, once."""
@@ -60,6 +73,7 @@ class Adoption:
     def _prepare(self, policy: Policy) -> ActingPolicy:
         if policy.version < self._newest_version:
             raise WeightsError(f"version {self._newest_version} was there before")
+        self._verifier.check(policy)
         arrays = verify(policy, self._spaces)
         if self._spaces.finite:
             return CategoricalPolicy(policy.version, arrays["probability"])

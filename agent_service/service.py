@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.messages import Action, Command, CommandReply, Policy, Spec, Step
+from rtcore.signing import Verifier
 
 WAIT_S = 0.2  # how long a wait may last before `stop`, or a failure, is looked at
+HANGS_NS = 1_000_000_000  # an answer takes under a millisecond
 AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's
 
 
@@ -40,13 +43,19 @@ class AgentService:
         ledger: Ledger,
         last_published: Policy | None = None,
         evidence: Evidence | None = None,
+        verifier: Verifier | None = None,
+        keep: Callable[[Policy], None] | None = None,
     ) -> None:
-        """`last_published` is the run's newest policy so far, for an agent that starts beside no learner."""
+        """`last_published` is the run's newest policy so far, for an agent that starts beside no learner;
+        `verifier` checks who signed a policy, None: nobody does; `keep` is given each good new policy.
+        """
+        self._keep = keep
         name = config.env.name
         self._name = name
         self._bus = bus
         self._clock = clock
         self._last_published = last_published
+        self._verifier = verifier
         self._ledger = ledger
         self._rng = np.random.default_rng([config.seed, AGENT_STREAM])
         self._specs = bus.latest(channels.SPEC, name)
@@ -55,6 +64,8 @@ class AgentService:
         self._acting = threading.Lock()  # two links may deliver at once while one replaces the other
         self._failure: Exception | None = None
         self._closed = False
+        self._acting_since_ns = 0  # 0: not acting
+        self._hang_told = False
         self._evidence = evidence or Evidence(clock.now_ns)
         self._spec: Spec | None = None
         self._freshness = Freshness(0)
@@ -68,7 +79,19 @@ class AgentService:
         self.attend()
         while not stop.wait(WAIT_S):
             self.check()
+            self._beat()
         self.check()
+
+    def _beat(self) -> None:
+        """Say that the agent lives, unless an answer takes so long that acting must hang."""
+        now_ns, since_ns = self._clock.now_ns(), self._acting_since_ns
+        if since_ns == 0 or now_ns - since_ns < HANGS_NS:
+            self._ledger.beat(now_ns)
+            self._hang_told = False
+        elif not self._hang_told:
+            self._hang_told = True
+            text = f"an observation has been answered for {(now_ns - since_ns) / 1e9:.1f} s: acting hangs"
+            self._ledger.event(now_ns, "ERROR", text)
 
     def check(self) -> None:
         """Raise what acting has failed with, if it has: nothing may be raised into the bus."""
@@ -169,11 +192,13 @@ class AgentService:
             self._ledger.count("observations.superseded")
             return
         try:
+            self._acting_since_ns = received.received_ns
             if self._failure is None and not self._closed:
                 self.act(received)
         except Exception as error:  # noqa: BLE001 - nothing may be raised into the bus; `check` raises it
             self._failure = error
         finally:
+            self._acting_since_ns = 0
             self._acting.release()
 
     def _swap(self, step: Step) -> None:
@@ -206,7 +231,7 @@ class AgentService:
         if self._spec is None:  # a later one is the same world in a new incarnation
             low, high = np.asarray(spec.action_low, np.float32), np.asarray(spec.action_high, np.float32)
             self._policy = UniformChoice(spec.actions) if spec.states else UniformPolicy(low, high)
-            self._adoption = Adoption(spec, self._ledger)
+            self._adoption = Adoption(spec, self._ledger, self._verifier, self._keep)
         self._freshness = Freshness(spec.tick_ns)
         self._spec = spec
 

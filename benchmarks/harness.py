@@ -31,10 +31,11 @@ from launcher.supervisor import Interrupts, Supervisor, command_for
 from rtcore import channels
 from rtcore.config import RunConfig
 from rtcore.config_check import check
+from rtcore.files import write_atomic
 from rtcore.messages import Architecture, Policy, Stats
 from rtcore.monotonic import MonotonicClock
 from rtcore.realtime import Rt
-from rtcore.run_dir import RunDir, write_atomic
+from rtcore.run_dir import RunDir
 from rtcore.weights import expected_shapes, pack, sha256
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import closing
 
+from env_server.announcing import Past
 from env_server.service import EnvService
 from env_server.worlds.registry import make_world
 from rtcore import channels
@@ -23,6 +24,7 @@ def serve(process: Process) -> None:
             process.clock,
             process.ledger,
             process.incarnation,
+            past=Past(process.run_dir),
             resumed_ns=process.continuations.all_ns,
         )
         bus.serve(channels.ENV_SERVER, lambda command: service.command(command, stop))

@@ -11,8 +11,8 @@ from rtcore.pacer import Pacer, Tick
 
 COUNTERS = (
     "ticks", "resets", "produced", "episodes", "missed", *(f"missed.{cause}" for cause in CAUSES),
-    "overruns", "skipped", "action.stale", "action.invalid", "action.clipped", "world.broken",
-    "log.dropped", "log.errors",
+    "overruns", "skipped", "down", "lives", "action.stale", "action.invalid", "action.clipped",
+    "world.broken", "log.dropped", "log.errors",
 )  # fmt: skip
 OVERRUN_EVENT_NS = 1_000_000_000  # at most one line per second about overruns
 
@@ -43,11 +43,19 @@ class Accounts:
         for name in COUNTERS:
             ledger.count(name, 0)  # a counter that stays 0 is reported as well
 
+    def begin(self, down: int) -> None:
+        """Enter the beginning of this life, with the deadlines that passed while no env server lived."""
+        self._ledger.count("lives")
+        self._ledger.count("down", down)
+
+    def executed(self, turn: Turn) -> None:
+        """Enter an executed tick before anybody can learn from it: then no kill leaves more learned than
+        produced."""
+        self._ledger.count_together("ticks", "resets" if turn.decision is None else "produced")
+
     def tick(self, tick: Tick, turn: Turn, latency: Latency, *, absent: bool = False) -> None:
-        """Enter one executed tick; `absent`: there is no agent to answer it."""
+        """Enter what an executed tick was like; `absent`: there is no agent to answer it."""
         count = self._ledger.count
-        count("ticks")
-        count("resets" if turn.decision is None else "produced")
         self._pacing.record(max(0, tick.woke_ns - tick.due_ns))
         if latency.loop_ns >= 0:
             self._loop.record(latency.loop_ns)

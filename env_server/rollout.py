@@ -58,6 +58,7 @@ class Rollout:
     def __init__(
         self, world: World, actuation: Actuation, *, episode_steps: int, seed: int, notify: Notify = "none"
     ) -> None:
+        """Episodes are numbered from 0, or from what `go_on_from` says before the first turn."""
         self._world = world
         self._notify = notify
         self._actuation = actuation
@@ -68,6 +69,11 @@ class Rollout:
         self._return = 0.0
         self._ended = True
         self._last_good: Vector = np.zeros(world.observation_dim, np.float32)
+
+    def go_on_from(self, episode: int) -> None:
+        """Number episodes from `episode` on: an earlier life had those before it, and the start of an episode
+        follows from its number."""
+        self._episode = episode - 1
 
     def turn(self, newest: Action | None, t: int, *, expected_tick: int) -> Turn:
         """One tick in unit `t`: a reset if the episode has ended, else a step. See `Actuation.decide`."""

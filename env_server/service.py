@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from env_server import announcing
 from env_server.accounts import Accounts, Latency
 from env_server.actuation import Actuation, Rules
+from env_server.announcing import Past
 from env_server.blame import Blame, Miss
 from env_server.journal import Journal
 from env_server.rehearsal import Rehearsal
@@ -25,9 +26,6 @@ from rtcore.lifecycle import Stop
 from rtcore.messages import Action, Command, CommandReply, Step
 from rtcore.pacer import Pacer, Tick
 
-LEAD_NS = 100_000_000  # from announcing T0 to T0, so that the spec is with everybody before step 0
-PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for in any case
-PEERS_POLL_S = 0.05
 REMEMBERED_TICKS = 64  # sending times kept, so that a late answer's latency is known too
 ACTIONS_KEPT = (
     64  # between two deadlines there are two, with the rehearsal's, unless this process was stalled
@@ -79,10 +77,10 @@ class EnvService:
         ledger: Ledger,
         incarnation: int,
         *,
-        wall_ns: Callable[[], int] = time.time_ns,
+        past: Past | None = None,
         resumed_ns: Callable[[], Sequence[int]] = tuple,
     ) -> None:
-        """`config.env` is resolved (`worlds.resolve`), `world` is its world, `wall_ns` Unix time,
+        """`config.env` is resolved (`worlds.resolve`), `world` is its world, `past` tells when the run began,
         `resumed_ns` gives the instants at which this process was continued after a stop.
         """
         env = config.env
@@ -92,7 +90,7 @@ class EnvService:
         self._clock = clock
         self._ledger = ledger
         self._incarnation = incarnation
-        self._wall_ns = wall_ns
+        self._past = past or Past()
         self._tick_ns = tick_ns(env)
         self._unit_ns = unit_ns(env)
         rules = Rules.of(env, world, incarnation=incarnation)
@@ -136,40 +134,39 @@ class EnvService:
             self._actions.wait(LAST_ANSWER_S)
 
     def wait_for_peers(self, stop: Stop) -> None:
-        """Wait until agent and learner are there, and the recorder of a run that is recorded: whoever comes
-        later finds only the newest policy. `env.start_wait_s` at most.
-        """
-        wait_s = self._config.env.start_wait_s
-        peers = PEERS | ({channels.RECORDER} if self._config.recorder.record else set())
-        limit_ns = self._clock.now_ns() + round(wait_s * 1e9)
-        while missing := peers - self._bus.alive():
-            now_ns = self._clock.now_ns()
-            if now_ns >= limit_ns:
-                names = " and ".join(sorted(missing))
-                self._ledger.event(now_ns, "WARN", f"starting without {names} after {wait_s:g} s")
-                return
-            if stop.wait(min(PEERS_POLL_S, (limit_ns - now_ns) / 1e9)):
-                return
+        """Wait for whom T0 waits for; see `announcing.wait_for_peers`."""
+        announcing.wait_for_peers(self._config, self._past, self._bus, self._clock, self._ledger, stop)
 
     def announce(self) -> None:
-        """Set T0, declare the environment, and make the pacer: `duration_s` holds a fixed number of ticks."""
+        """Settle T0, declare the environment, and make the pacer: `duration_s` holds a fixed number of
+        ticks.
+
+        Raises:
+            ConfigError: the run has begun, and when cannot be read.
+        """
         env = self._config.env
-        now_ns = self._clock.now_ns()
-        self._t0_ns = now_ns + LEAD_NS
-        num_ticks = max(1, round(self._config.duration_s * 1e9 / self._tick_ns))
-        end_index = num_ticks if self._config.duration_s > 0 else None
-        self._pacer = Pacer(self._clock, t0_ns=self._t0_ns, period_ns=self._tick_ns, end_index=end_index)
-        spec = word_spec(
-            env,
-            self._world,
-            incarnation=self._incarnation,
-            t0_ns=self._t0_ns,
-            wall_t0_ns=self._wall_ns() + LEAD_NS,
-            tick_ns=self._tick_ns,
+        beginning = announcing.begin(
+            self._config, self._past, self._clock, self._ledger, tick_ns=self._tick_ns
         )
+        epoch = beginning.epoch
+        self._t0_ns = epoch.t0_ns
+        self._rollout.go_on_from(beginning.first_episode)
+        self._accounts.begin(beginning.down)
+        self._pacer = Pacer(
+            self._clock,
+            t0_ns=self._t0_ns,
+            period_ns=self._tick_ns,
+            first_index=beginning.first_index,
+            end_index=beginning.end_index,
+            beat=self._ledger.beat,
+        )
+        spec = word_spec(env, self._world, epoch, incarnation=self._incarnation, tick_ns=self._tick_ns)
         self._specs.put(spec)
         speed = "" if env.speed is None else f", {env.speed:g} times native speed"
-        self._ledger.event(now_ns, "INFO", f"{env.id} at {1e9 / self._tick_ns:g} Hz{speed}")
+        text = f"{env.id} at {1e9 / self._tick_ns:g} Hz{speed}"
+        if epoch.lives > 1:
+            text += f"; goes on at tick {beginning.first_index}, {beginning.down} passed meanwhile"
+        self._ledger.event(self._clock.now_ns(), "INFO", text)
 
     def step(self, tick: Tick) -> None:
         """One deadline, and its books. Never waits."""
@@ -197,6 +194,7 @@ class EnvService:
 
     def book(self, entry: Entry) -> None:
         """Enter an executed tick into the ledger, and into the log all steps whose story is complete."""
+        self._accounts.executed(entry.turn)
         self._hear(entry.heard, entry.step.tick)
         for received in entry.heard[:-1]:
             self._accounts.superseded(self._latency(received))

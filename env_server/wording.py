@@ -8,6 +8,7 @@ from env_server.accounts import Latency
 from env_server.rollout import Turn
 from env_server.worlds.world import Position, World
 from rtcore.config import EnvConfig
+from rtcore.epoch import Epoch
 from rtcore.messages import Spec, Step
 from rtcore.pacer import Tick
 
@@ -23,17 +24,15 @@ class Stamp:
     sent_ns: int
 
 
-def word_spec(
-    env: EnvConfig, world: World, *, incarnation: int, t0_ns: int, wall_t0_ns: int, tick_ns: int
-) -> Spec:
-    """The declaration of a resolved `env`."""
+def word_spec(env: EnvConfig, world: World, epoch: Epoch, *, incarnation: int, tick_ns: int) -> Spec:
+    """The declaration of a resolved `env` in a run that began at `epoch`."""
     simulated_s = 0.0 if env.speed is None else env.speed * tick_ns / 1e9
     return Spec(
         env=env.name,
         env_id=env.id,
         incarnation=incarnation,
-        t0_ns=t0_ns,
-        wall_t0_ns=wall_t0_ns,
+        t0_ns=epoch.t0_ns,
+        wall_t0_ns=epoch.wall_t0_ns,
         tick_ns=tick_ns,
         unit_ns=unit_ns(env),
         observation_dim=observation_dim(env, world),
@@ -45,6 +44,7 @@ def word_spec(
         scene=world.scene,
         states=world.states,
         actions=world.actions,
+        host=epoch.boot_id,
     )
 
 

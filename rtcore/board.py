@@ -7,7 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from rtcore.run_dir import write_atomic
+from rtcore.files import write_atomic
 
 SAFE, START, GOAL, RESTART = ".", "S", "G", "R"
 

@@ -6,12 +6,21 @@ Transport settings and health both follow from the row; nothing else names a key
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from rtcore import messages
 
 MessageT = TypeVar("MessageT", bound=messages.Message)
+
+ENV_SERVER, AGENT, LEARNER, RECORDER = "env_server", "agent_service", "learner", "recorder"
+PROCESSES = (ENV_SERVER, AGENT, LEARNER, RECORDER)  # in connect order: each connects to the earlier ones
+LAUNCHER = "launcher"
+
+
+def accept(message: messages.Message) -> None:
+    """Every message that decodes."""
 
 
 class Delivery(enum.Enum):
@@ -37,6 +46,8 @@ class Channel(Generic[MessageT]):
         max_age_s: older than this and the sender counts as late; None: never.
         max_bytes: larger messages are refused and counted, on both sides.
         recorded: whether the recorder subscribes to it.
+        writers: the roles that may publish on it; of several, each under its own name alone.
+        check: says ValueError to a message that decodes but cannot be meant; it is then rejected.
     """
 
     name: str
@@ -47,24 +58,29 @@ class Channel(Generic[MessageT]):
     max_age_s: float | None
     max_bytes: int
     recorded: bool
+    writers: tuple[str, ...]
+    check: Callable[[MessageT], None] = accept
 
     def key_for(self, name: str = "") -> str:
         """The key for one environment or process."""
         return self.key.format(name=name)
 
 
-SPEC = Channel("spec", "env/{name}/spec", messages.Spec, Delivery.RETAINED, 0, None, 65_536, True)
-STEP = Channel("step", "env/{name}/step", messages.Step, Delivery.REALTIME, None, 2.0, 30_000, False)
-LOG = Channel("log", "env/{name}/log", messages.StepBatch, Delivery.LOSSLESS, 20, 2.0, 4 << 20, True)
-ACTION = Channel("action", "env/{name}/action", messages.Action, Delivery.REALTIME, None, 2.0, 30_000, False)
-POLICY = Channel("policy", "policy", messages.Policy, Delivery.RETAINED, 0, None, 32 << 20, True)
-WINDOW = Channel("window", "window", messages.WindowNotice, Delivery.RETAINED, 0, None, 65_536, True)
-STATS = Channel("stats", "stats/{name}", messages.Stats, Delivery.TELEMETRY, 4, 2.0, 1 << 20, True)
+_ENV, _ALL = (ENV_SERVER,), (*PROCESSES, LAUNCHER)
+
+SPEC = Channel("spec", "env/{name}/spec", messages.Spec, Delivery.RETAINED, 0, None, 65_536, True, _ENV)
+STEP = Channel("step", "env/{name}/step", messages.Step, Delivery.REALTIME, None, 2.0, 30_000, False, _ENV)
+LOG = Channel("log", "env/{name}/log", messages.StepBatch, Delivery.LOSSLESS, 20, 2.0, 4 << 20, True, _ENV)
+ACTION = Channel(
+    "action", "env/{name}/action", messages.Action, Delivery.REALTIME, None, 2.0, 30_000, False, (AGENT,)
+)
+POLICY = Channel("policy", "policy", messages.Policy, Delivery.RETAINED, 0, None, 32 << 20, True, (LEARNER,))
+WINDOW = Channel(
+    "window", "window", messages.WindowNotice, Delivery.RETAINED, 0, None, 65_536, True, (LEARNER,)
+)
+STATS = Channel("stats", "stats/{name}", messages.Stats, Delivery.TELEMETRY, 4, 2.0, 1 << 20, True, _ALL)
 
 TABLE = (SPEC, STEP, LOG, ACTION, POLICY, WINDOW, STATS)
 
 CONTROL_KEY = "control/{name}"  # query and reply: messages.Command -> messages.CommandReply
 ALIVE_KEY = "alive/{name}"  # liveliness token
-
-ENV_SERVER, AGENT, LEARNER, RECORDER = "env_server", "agent_service", "learner", "recorder"
-PROCESSES = (ENV_SERVER, AGENT, LEARNER, RECORDER)  # in connect order: each connects to the earlier ones

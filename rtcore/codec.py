@@ -128,11 +128,14 @@ class Codec(Generic[MessageT]):
         return False
 
     def decode(self, payload: bytes) -> MessageT | None:
-        """The message, or None (and one more on the count) if the bytes are not a valid one."""
+        """The message, or None, and one more on the count: the bytes are not a valid one, or the channel's
+        check refuses it."""
         if not self.intact(payload):
             return None
         try:
-            return self._decode(memoryview(payload)[:-CRC_BYTES])
+            message = self._decode(memoryview(payload)[:-CRC_BYTES])
+            self._channel.check(message)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             self._rejections.count(self._channel.name, error)
             return None
+        return message

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from rtcore.histogram import Histogram
 from rtcore.messages import EpisodeReturn, Event, Level, Stats, WindowNotice
+from rtcore.tally import Tally
 
 EVENTS_DROPPED = "events.dropped"
 # Bounds that keep a running process's message below the channel's 1 MiB: 256 events of 500 characters
@@ -31,12 +32,15 @@ class Ledger:
     """One process's books. Thread-safe, except that a histogram has one thread that records in it.
 
     Counters only rise; `stats` is a snapshot of everything since the start, so a lost message loses
-    nothing but, after 10 s, its events, and those are in the process's log as well.
+    nothing but, after 10 s, its events, and those are in the process's log as well. A `tally` has every
+    counter at every instant, for the case that the process is killed before its next message.
     """
 
-    def __init__(self, process: str, incarnation: int) -> None:
+    def __init__(self, process: str, incarnation: int, tally: Tally | None = None) -> None:
         self._process = process
         self._incarnation = incarnation
+        self._tally = tally
+        self._beat_ns = 0
         self._logger = logging.getLogger(process)
         self._lock = threading.Lock()
         self._seq = 0
@@ -49,16 +53,22 @@ class Ledger:
         self._windows: list[WindowNotice] = []
 
     def count(self, name: str, n: int = 1) -> None:
-        """Add `n` >= 0 to a counter, which starts at 0: 0.3 us."""
+        """Add `n` >= 0 to a counter, which starts at 0: 0.26 us, with a tally 0.34."""
         if n < 0:
             raise ValueError(f"{name}: n = {n}: a counter does not fall")
         with self._lock:
-            self._counters[name] += n
+            value = self._counters[name] = self._counters[name] + n
+            if self._tally is not None:
+                self._tally.set(name, value)
 
     def count_together(self, *names: str) -> None:
-        """Add one to each: no snapshot has only some of it."""
+        """Add one to each, of at most 16: no snapshot, and no tally, has only some of it."""
         with self._lock:
-            self._counters.update(names)
+            counters = self._counters
+            for name in names:
+                counters[name] += 1
+            if self._tally is not None:
+                self._tally.set_together({name: counters[name] for name in names})
 
     def set_counter(self, name: str, value: int) -> None:
         """Take over a count that is kept elsewhere, such as the bus's; it must not fall either."""
@@ -66,6 +76,8 @@ class Ledger:
             if value < self._counters[name]:
                 raise ValueError(f"{name}: {value} after {self._counters[name]}: a counter does not fall")
             self._counters[name] = value
+            if self._tally is not None:
+                self._tally.set(name, value)
 
     def counter(self, name: str) -> int:
         """The counter's value; 0 if nothing was counted."""
@@ -76,6 +88,10 @@ class Ledger:
         """Set a quantity that goes up and down."""
         with self._lock:
             self._gauges[name] = value
+
+    def beat(self, now_ns: int) -> None:
+        """Say that the process's own loop turns; at least once a second from that loop, and only from it."""
+        self._beat_ns = now_ns
 
     def histogram(self, name: str) -> Histogram:
         """The histogram of that name, made on first use. Keep it: recording needs no ledger."""
@@ -92,6 +108,8 @@ class Ledger:
         with self._lock:
             if self._unsent == MAX_EVENTS:
                 self._counters[EVENTS_DROPPED] += 1
+                if self._tally is not None:
+                    self._tally.set(EVENTS_DROPPED, self._counters[EVENTS_DROPPED])
             self._unsent = min(self._unsent + 1, MAX_EVENTS)
             self._events.append(Event(at_ns=at_ns, level=level, text=text[:MAX_TEXT]))
 
@@ -130,4 +148,5 @@ class Ledger:
                 events=list(self._events),
                 returns=self._returns[0 if final else -RECENT_RETURNS :],
                 windows=self._windows[0 if final else -RECENT_WINDOWS :],
+                beat_ns=self._beat_ns,
             )

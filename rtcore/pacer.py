@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from rtcore.clock import Clock
@@ -28,7 +28,7 @@ class Pacer:
     Deadlines are absolute: a late tick delays no other. Overrun: if the pacer wakes for tick k at or
     after D_{k+1}, the ticks before the latest D_j <= now are skipped and counted, never run back to
     back, and the phase stays. If D_j is at `end_index` or beyond, the ticks up to the end are lost
-    and none follows, so without a stop `executed + skipped_total == end_index`.
+    and none follows, so without a stop `executed + skipped_total == end_index - first_index`.
 
     Attributes:
         executed: ticks yielded.
@@ -36,14 +36,32 @@ class Pacer:
         skipped_total: deadlines lost.
     """
 
-    def __init__(self, clock: Clock, *, t0_ns: int, period_ns: int, end_index: int | None = None) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        t0_ns: int,
+        period_ns: int,
+        first_index: int = 0,
+        end_index: int | None = None,
+        beat: Callable[[int], None] | None = None,
+    ) -> None:
+        """Args:
+        clock: waited on.
+        t0_ns: D_0, which may have passed long ago.
+        period_ns: from one deadline to the next.
+        first_index: the first tick; those before it are somebody else's.
+        end_index: the tick after the last; None: without end.
+        beat: called with the instant at least once per tick, and every 200 ms of a wait.
+        """
         if period_ns <= 0:
             raise ConfigError("period_ns", period_ns, "must be a positive number of nanoseconds")
         self._clock = clock
         self._t0_ns = t0_ns
         self._period_ns = period_ns
         self._end_index = end_index
-        self._next_index = 0
+        self._next_index = first_index
+        self._beat = beat
         self.executed = 0
         self.overruns = 0
         self.skipped_total = 0
@@ -73,6 +91,8 @@ class Pacer:
         """
         while not stop.is_set():
             now_ns = self._clock.now_ns()
+            if self._beat is not None:
+                self._beat(now_ns)
             remaining_ns = due_ns - now_ns
             if remaining_ns <= 0:
                 return True

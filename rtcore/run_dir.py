@@ -1,29 +1,24 @@
-"""The directory of one run: where everything lies, how it is made, and how files in it are replaced whole."""
+"""The directory of one run: where everything lies, and how it is made."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import re
-import stat
-import threading
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
-from rtcore.channels import PROCESSES
+from rtcore import socket_dir, tally
 from rtcore.config import ConfigError, RunConfig
 from rtcore.config_check import check
 from rtcore.config_io import dump_toml, load_toml
+from rtcore.files import write_atomic
 from rtcore.messages import Policy, Stats
-
-# The kernel takes 107 bytes for a unix socket's path; 100 leaves room for a longer name than today's.
-SOCKET_PATH_BYTES = 100
-# Fixed rather than $TMPDIR: all processes of a run must find the same directory, whoever started them.
-TEMP = Path("/tmp")
 
 _LOGGER = logging.getLogger(__name__)
 _FOLDERS = ("learner", "logs")
@@ -102,13 +97,16 @@ class RunDir:
 
     def read_policy(self) -> Policy | None:
         """The newest published policy; None if none was, or if the file is damaged, which is logged."""
-        try:
-            return msgspec.msgpack.decode(self.policy_path.read_bytes(), type=Policy)
-        except FileNotFoundError:
-            return None
-        except (OSError, msgspec.DecodeError) as error:
-            _LOGGER.warning("%s: %s", self.policy_path, error)
-            return None
+        return _read_policy(self.policy_path)
+
+    @property
+    def adopted_path(self) -> Path:
+        """`agent/policy.msgpack`: the newest policy that the agent took, where no learner keeps one."""
+        return self.path / "agent" / "policy.msgpack"
+
+    def read_adopted(self) -> Policy | None:
+        """What is in `adopted_path`; None as in `read_policy`."""
+        return _read_policy(self.adopted_path)
 
     @property
     def logs_dir(self) -> Path:
@@ -127,6 +125,15 @@ class RunDir:
     def stats_path(self, process: str, incarnation: int) -> Path:
         """`logs/<process>-<incarnation>.stats`: the last ledger of one life of a process."""
         return self.logs_dir / f"{_plain(process)}-{incarnation}.stats"
+
+    def tally_path(self, process: str, incarnation: int) -> Path:
+        """`logs/<process>-<incarnation>.tally`: the counters of one life of a process, at every instant."""
+        return self.logs_dir / f"{_plain(process)}-{incarnation}.tally"
+
+    @property
+    def epoch_path(self) -> Path:
+        """`epoch.json`: when the run began (`rtcore.epoch`)."""
+        return self.path / "epoch.json"
 
     def config(self) -> RunConfig:
         """The run's configuration, checked: people edit `run.toml`.
@@ -147,48 +154,59 @@ class RunDir:
         write_atomic(self.stats_path(stats.process, stats.incarnation), msgspec.msgpack.encode(stats))
 
     def read_final_stats(self) -> list[Stats]:
-        """The last ledgers, by process and incarnation. One that does not decode is logged and left out."""
-        found = []
+        """The ledgers of all lives, by process and incarnation: the last words, with the counters of the
+        tally where they are higher; of a life that was killed, `final` is false and only the tally's counters
+        are there. A file that cannot be read is logged and left out.
+        """
+        found: dict[tuple[str, int], Stats] = {}
         for path in self.logs_dir.glob("*.stats"):
             try:
-                found.append(msgspec.msgpack.decode(path.read_bytes(), type=Stats))
+                stats = msgspec.msgpack.decode(path.read_bytes(), type=Stats)
             except (OSError, msgspec.DecodeError) as error:
                 _LOGGER.warning("%s left out of the summary: %s", path.name, error)
-        return sorted(found, key=lambda stats: (stats.process, stats.incarnation))
+                continue
+            found[stats.process, stats.incarnation] = stats
+        for life, counters in self._tallies():
+            stats = found.get(life) or Stats(
+                process=life[0], incarnation=life[1], seq=0, at_ns=0, final=False, counters={}, gauges={},
+                histograms={},
+            )  # fmt: skip
+            found[life] = replace(stats, counters=tally.raised(stats.counters, counters))
+        return [found[life] for life in sorted(found)]
+
+    def next_incarnation(self, process: str, wall_ns: int) -> int:
+        """A number for a life that begins at Unix time `wall_ns`: greater than that of every life of the
+        process that left anything here, whatever became of the clock."""
+        earlier = [
+            int(found[1])
+            for path in self.logs_dir.glob(f"{_plain(process)}-*")
+            if (found := re.fullmatch(rf"{process}-(\d{{1,19}})\.(stats|tally)", path.name))
+        ]
+        return max([wall_ns, *(life + 1 for life in earlier)])
+
+    def _tallies(self) -> Iterator[tuple[tuple[str, int], dict[str, int]]]:
+        for path in self.logs_dir.glob("*.tally"):
+            life = re.fullmatch(r"([A-Za-z0-9_-]+)-(\d{1,19})\.tally", path.name)
+            if life is None:
+                continue
+            try:
+                counters = tally.read(path)
+            except OSError as error:
+                _LOGGER.warning("%s left out of the summary: %s", path.name, error)
+                continue
+            yield (life[1], int(life[2])), counters
 
     def socket_dir(self) -> Path:
-        """The directory of the run's unix sockets (`<process>.sock`), made if need be: private to this
-        user, the same for every process of the run, short enough for the kernel and free of what means
-        something in an endpoint. It is `link` in the run if that will do, else one below /tmp.
+        """The directory of the run's unix sockets, made if need be; see `rtcore.socket_dir.make`.
 
         Raises:
             ConfigError: it cannot be made, or others could reach into it.
         """
-        directory = self._socket_path()
-        try:
-            with suppress(FileExistsError):
-                directory.mkdir(mode=0o700)
-            found = directory.lstat()
-        except OSError as error:
-            allowed = f"must be a directory that can be made ({error.strerror})"
-            raise ConfigError("run_dir.socket_dir", str(directory), allowed) from error
-        mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
-        if not mine or stat.S_IMODE(found.st_mode) & 0o077:
-            allowed = f"must be a directory of user {os.geteuid()} with mode 0700"
-            raise ConfigError("run_dir.socket_dir", str(directory), allowed)
-        return directory
+        return socket_dir.make(self.path)
 
     def remove_socket_dir(self) -> None:
-        """Remove the sockets' directory with the stale sockets and locks in it, once every process of the
-        run has ended. What else lies there stays, and so does the directory then."""
-        directory = self._socket_path()
-        if not directory.is_dir() or directory.is_symlink() or directory.stat().st_uid != os.geteuid():
-            return
-        for process in PROCESSES:
-            for name in (f"{process}.sock", f"{process}.sock.lock"):
-                (directory / name).unlink(missing_ok=True)
-        with suppress(OSError):
-            directory.rmdir()
+        """Remove the sockets' directory with what is stale in it; see `rtcore.socket_dir.remove`."""
+        socket_dir.remove(self.path)
 
     def remove_if_empty(self) -> bool:
         """Take `create` back after a failed start: if no process has written anything yet, remove the
@@ -198,7 +216,7 @@ class RunDir:
         if set(self.path.iterdir()) != expected or any(any(folder.iterdir()) for folder in folders):
             return False
         with suppress(OSError):  # none, or sockets in it
-            self._socket_path().rmdir()
+            socket_dir.path_for(self.path).rmdir()
         for folder in folders:
             _rmdir(folder)
         self.config_path.unlink()
@@ -225,38 +243,6 @@ class RunDir:
             write_atomic(self.config_path, config)
             undo.pop_all()
 
-    def _socket_path(self) -> Path:
-        # Resolved: processes that were given the run by different paths must come to the same answer.
-        home = self.path.resolve()
-        near = home / "link"
-        longest = max(len(os.fsencode(near / f"{process}.sock")) for process in PROCESSES)
-        if longest <= SOCKET_PATH_BYTES and re.fullmatch(r"[A-Za-z0-9_./+-]+", str(near)):
-            return near
-        digest = hashlib.sha256(os.fsencode(home)).hexdigest()[:16]
-        return TEMP / f"tenuto-{os.geteuid()}-{digest}"
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file so that, whatever happens, there is the old one or the new one, whole and on the disk.
-
-    Raises:
-        OSError: it could not be written; the old one is untouched.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(directory)  # the rename itself
-    finally:
-        os.close(directory)
-
 
 def default_run_path(root: Path, preset: str, now: datetime) -> Path:
     """`<root>/<UTC time, like 20260131T235959Z>-<preset>`; `now` knows its time zone."""
@@ -275,6 +261,16 @@ def latest(root: Path) -> RunDir | None:
 def _absolute(path: Path) -> Path:
     # Path.absolute would keep "..", and the run's name with it.
     return Path(os.path.abspath(path))  # noqa: PTH100
+
+
+def _read_policy(path: Path) -> Policy | None:
+    try:
+        return msgspec.msgpack.decode(path.read_bytes(), type=Policy)
+    except FileNotFoundError:
+        return None
+    except (OSError, msgspec.DecodeError) as error:
+        _LOGGER.warning("%s: %s", path, error)
+        return None
 
 
 def _plain(process: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from env_server.worlds.finite import FiniteWorld
+from env_server.worlds.finite import FiniteWorld, Floats, Tables
 
 ARMS = 2
 
@@ -26,6 +26,15 @@ class Bandit(FiniteWorld):
     def __init__(self, drift: Callable[[int], float], *, seed: int) -> None:
         """`drift` gives v in unit t; the rewards' draws come from `seed`."""
         super().__init__(states=1, actions=ARMS, drift=drift, seed=seed)
+
+    def tables(self, t: int) -> Tables:
+        """The mean rewards, and one state that leads to itself."""
+        reward = np.array([[chance(self.drift(t), arm) for arm in range(ARMS)]])
+        return Tables(reward, np.ones((1, ARMS, 1)))
+
+    def starts(self) -> Floats:
+        """The only state."""
+        return np.ones(1)
 
     def start(self, _drift: float) -> int:
         """The only state."""

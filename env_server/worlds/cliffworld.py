@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from env_server.worlds.finite import FiniteWorld
+from env_server.worlds.finite import FiniteWorld, Floats, Tables
 from env_server.worlds.world import Position
 from rtcore.board import Board, save_board
 from rtcore.config import CliffConfig
@@ -34,7 +34,7 @@ SWITCH = 0.5  # the drift's value from which on the second goal pays; below it t
 
 
 @dataclass(frozen=True)
-class Tables:
+class Rules:
     """The world with one goal active, each by state and action.
 
     Attributes:
@@ -48,7 +48,7 @@ class Tables:
     terminated: NDArray[np.bool_]
 
 
-def tables(cliff: CliffConfig, goal: int) -> Tables:
+def tables(cliff: CliffConfig, goal: int) -> Rules:
     """The world while goal number `goal`, 0 or 1, is active; the other is as `cliff.inactive_goal` says."""
     cells = "".join(BOARD.rows)
     earns = np.full(STATES, cliff.step_reward)
@@ -60,9 +60,9 @@ def tables(cliff: CliffConfig, goal: int) -> Tables:
     next_state = np.array([[_moved(state, move) for move in MOVES] for state in range(STATES)])
     next_state[[cell == "R" for cell in cells]] = START
     if cliff.pays == "arrive":
-        return Tables(next_state, earns[next_state], ends[next_state])
+        return Rules(next_state, earns[next_state], ends[next_state])
     next_state[ends] = np.flatnonzero(ends)[:, None]
-    return Tables(next_state, *(np.repeat(of_cell[:, None], len(MOVES), 1) for of_cell in (earns, ends)))
+    return Rules(next_state, *(np.repeat(of_cell[:, None], len(MOVES), 1) for of_cell in (earns, ends)))
 
 
 def active_goal(drift: float) -> int:
@@ -84,8 +84,17 @@ class Cliffworld(FiniteWorld):
     def __init__(self, cliff: CliffConfig, drift: Callable[[int], float], *, seed: int) -> None:
         """`drift` gives the value in unit t that `active_goal` reads."""
         super().__init__(states=STATES, actions=len(MOVES), drift=drift, seed=seed)
-        self._tables = [tables(cliff, goal) for goal in range(len(GOALS))]
+        self._rules = [tables(cliff, goal) for goal in range(len(GOALS))]
         self._goal = 0
+
+    def tables(self, t: int) -> Tables:
+        """R_t and P_t of the 36 cells and the end, [37, 4] and [37, 4, 37]."""
+        return _with_end(self._rules[active_goal(self.drift(t))])
+
+    def starts(self) -> Floats:
+        """Always (0, 2)."""
+        at: Floats = (np.arange(STATES + 1) == START).astype(np.float64)
+        return at
 
     def start(self, drift: float) -> int:
         """Always (0, 2)."""
@@ -95,7 +104,7 @@ class Cliffworld(FiniteWorld):
     def transition(self, state: int, action: int, drift: float) -> tuple[int, float, bool]:
         """As the tables of the active goal have it."""
         self._goal = active_goal(drift)
-        now, at = self._tables[self._goal], (state, action)
+        now, at = self._rules[self._goal], (state, action)
         return int(now.next_state[at]), float(now.reward[at]), bool(now.terminated[at])
 
     def position(self) -> Position:
@@ -105,6 +114,15 @@ class Cliffworld(FiniteWorld):
     def save_scene(self, path: Path, /) -> None:
         """Write the board, as JSON beside `path`."""
         save_board(BOARD, path)
+
+
+def _with_end(rules: Rules) -> Tables:
+    """What terminates leads to the end instead of to a cell."""
+    following = np.full((STATES + 1, len(MOVES)), STATES)
+    following[:STATES] = np.where(rules.terminated, STATES, rules.next_state)
+    reward = np.zeros(following.shape)
+    reward[:STATES] = rules.reward
+    return Tables(reward, np.eye(STATES + 1)[following])
 
 
 def _place(state: int) -> tuple[int, int]:

@@ -4,11 +4,36 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from env_server.worlds.world import Outcome, Position, Vector
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """One MDP, whole.
+
+    Attributes:
+        reward: float64 [S, A], earned on leaving state s by action a.
+        transition: float64 [S, A, S], the probabilities of the next state; each row sums to 1.
+    """
+
+    reward: Floats
+    transition: Floats
+
+    def towards(self, other: Tables, weight: float) -> Tables:
+        """The MDP on the line from this one (`weight` 0) to `other` (1)."""
+        # In this form what is the same at both ends stays so to the last bit: it has a budget of 0.
+        return Tables(
+            self.reward + weight * (other.reward - self.reward),
+            self.transition + weight * (other.transition - self.transition),
+        )
 
 
 class FiniteWorld(ABC):
@@ -34,6 +59,18 @@ class FiniteWorld(ABC):
         self.drift = drift
         self.random = np.random.default_rng(seed)
         self.state = 0
+
+    @abstractmethod
+    def tables(self, t: int) -> Tables:
+        """R_t and P_t, exactly, so that values can be computed.
+
+        Where an episode can end by itself, S is `states` + 1: the last state is the end, which nothing
+        leaves and in which nothing is earned.
+        """
+
+    @abstractmethod
+    def starts(self) -> Floats:
+        """How likely an episode begins in each state, [S], with the S of `tables`."""
 
     @abstractmethod
     def start(self, drift: float) -> int:

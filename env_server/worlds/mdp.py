@@ -11,40 +11,15 @@ so whatever theory says about them can be checked against numbers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from env_server.worlds.finite import FiniteWorld
+from env_server.worlds.finite import FiniteWorld, Floats, Tables
 from rtcore.config import ConfigError, MdpConfig
-
-Floats = NDArray[np.float64]
 
 _STREAM = 1  # of the run's seed: what is drawn from it must not depend on how the steps are drawn
 LEFT, RIGHT = 0, 1
 MOST_PROBABILITIES = 1_000_000  # 8 MB a table, and one is made whenever the drift moves
-
-
-@dataclass(frozen=True, slots=True)
-class Tables:
-    """One MDP, whole.
-
-    Attributes:
-        reward: float64 [S, A], earned on leaving state s by action a.
-        transition: float64 [S, A, S], the probabilities of the next state; each row sums to 1.
-    """
-
-    reward: Floats
-    transition: Floats
-
-    def towards(self, other: Tables, weight: float) -> Tables:
-        """The MDP on the line from this one (`weight` 0) to `other` (1)."""
-        # In this form what is the same at both ends stays so to the last bit: it has a budget of 0.
-        return Tables(
-            self.reward + weight * (other.reward - self.reward),
-            self.transition + weight * (other.transition - self.transition),
-        )
 
 
 def random_ends(config: MdpConfig, seed: int) -> tuple[Tables, Tables]:
@@ -120,6 +95,10 @@ class DriftingMdp(FiniteWorld):
             found[1, t] = np.abs(then.transition - now.transition).sum(axis=-1).max()
             now = then
         return found[0], found[1]
+
+    def starts(self) -> Floats:
+        """Any state, one as likely as the other."""
+        return np.full(self.states, 1.0 / self.states)
 
     def start(self, _drift: float) -> int:
         """Any state."""

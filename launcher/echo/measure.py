@@ -25,7 +25,7 @@ from launcher.echo.pair import HELLO_LIMIT_S, Order, Outcome
 from launcher.quantiles import Nanoseconds, Quantiles, quantiles_us
 from rtcore.config import ConfigError
 from rtcore.realtime import Rt
-from rtcore.run_dir import TEMP
+from rtcore.socket_dir import TEMP
 
 POLL_S = 0.1
 END_LIMIT_S = 5.0

@@ -31,8 +31,9 @@ from launcher.out_dir import make_out_dir
 from launcher.parsing import parse
 from launcher.run import RUNS
 from rtcore.config import ConfigError, RunConfig
+from rtcore.files import write_atomic
 from rtcore.realtime import Rt
-from rtcore.run_dir import default_run_path, write_atomic
+from rtcore.run_dir import default_run_path
 
 RATES_HZ = (100.0, 200.0, 500.0, 1000.0)
 REFRESH_S = 1.0  # of the progress bar: drawing it costs a millisecond on the machine that is measured

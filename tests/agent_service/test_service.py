@@ -8,10 +8,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from agent_service.adoption import Adoption
 from agent_service.inference import UniformPolicy
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Architecture, Policy
+from rtcore.weights import WeightsError
 from tests.agent_service.rig import SPEC, Rig, policy, step, values
 
 
@@ -165,3 +167,52 @@ def test_beside_no_learner_the_last_published_policy_acts() -> None:
     answer = rig.answer(step(2))
     assert answer is not None and answer.policy_version == 10
     assert rig.ledger.counter("policies.repeated") == 1
+
+
+class OnlyVersion2:
+    """A verifier that knows whose version 2 is."""
+
+    def check(self, policy: Policy) -> None:
+        if policy.version != 2:
+            raise WeightsError("not signed by the learner")
+
+
+def test_what_the_verifier_refuses_is_not_adopted(rig: Rig) -> None:
+    adoption = Adoption(SPEC, rig.ledger, OnlyVersion2())
+    adoption.offer(policy(1), 0)
+    assert adoption.take() is None
+    adoption.offer(policy(2), 0)
+    assert adoption.take() is not None
+    counts = [rig.ledger.counter(f"policies.{name}") for name in ("received", "rejected")]
+    assert counts == [2, 1]
+
+
+def test_the_heart_stops_while_an_answer_hangs(rig: Rig) -> None:
+    """An answer that began at 1000 ns: after 1 s it hangs, which is said once; then it comes after all."""
+
+    def beats_ns() -> int:
+        return rig.ledger.stats(rig.clock.now_ns()).beat_ns
+
+    rig.agent._beat()
+    assert beats_ns() == 1_000
+    rig.agent._acting_since_ns = 1_000
+    rig.clock.advance_ns(999_999_999)
+    rig.agent._beat()
+    assert beats_ns() == 1_000_000_999
+    for _ in range(2):
+        rig.clock.advance_ns(500_000_000)
+        rig.agent._beat()
+        assert beats_ns() == 1_000_000_999
+    stats = rig.ledger.stats(rig.clock.now_ns())
+    assert [event.text for event in stats.events] == [
+        "an observation has been answered for 1.5 s: acting hangs"
+    ]
+    rig.agent._acting_since_ns = 0
+    rig.agent._beat()
+    assert beats_ns() == rig.clock.now_ns()
+
+
+def test_an_answer_is_over_when_it_is_given(rig: Rig) -> None:
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    assert rig.agent._acting_since_ns == 0

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from env_server.announcing import Past
 from env_server.service import EnvService
 from env_server.worlds.world import World
 from rtcore import channels
@@ -44,7 +45,8 @@ class Rig:
         self.bus = self.hub.bus("env", self.clock)
         self.resumed_ns: list[int] = []  # when the env server was continued after a stop
         self.service = EnvService(
-            config, self.world, self.bus, self.clock, self.ledger, 77, wall_ns=lambda: 5_000_000_000,
+            config, self.world, self.bus, self.clock, self.ledger, 77,
+            past=Past(wall_ns=lambda: 5_000_000_000),
             resumed_ns=lambda: self.resumed_ns,
         )  # fmt: skip
         self.agent = ScriptedAgent(self.hub.bus("agent", self.clock), self.clock)

@@ -7,7 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from env_server.worlds.mdp import Chain, DriftingMdp, RandomMdp, Tables, chain_ends, random_ends
+from env_server.worlds.finite import Tables
+from env_server.worlds.mdp import Chain, DriftingMdp, RandomMdp, chain_ends, random_ends
 from rtcore.config import ConfigError, MdpConfig
 
 BOTH = MdpConfig(states=4, actions=3, concentration=0.5, drifting="both")

@@ -15,6 +15,7 @@ from env_server.worlds.drift import make_drift
 from env_server.worlds.registry import make_world
 from env_server.worlds.world import Outcome, Vector, World
 from rtcore.config import DriftConfig, EnvConfig, Notify, PhysicsConfig, RewardConfig
+from rtcore.epoch import Epoch
 from rtcore.messages import Step
 from tests.env_server.every_world import NONE, SINE, WORLDS
 from tests.env_server.rig import Rig, run_config
@@ -193,7 +194,8 @@ def test_the_spec_declares_what_the_steps_carry(notify: Notify, dim: int) -> Non
     run = replace(run, env=replace(run.env, drift=SINE))
     world = make_world(run.env, 0)
     steps = Rig(run, world).run()
-    spec = word_spec(run.env, world, incarnation=1, t0_ns=0, wall_t0_ns=0, tick_ns=1)
+    epoch = Epoch(t0_ns=0, wall_t0_ns=0, boot_id="")
+    spec = word_spec(run.env, world, epoch, incarnation=1, tick_ns=1)
     assert {len(step.observation) // 4 for step in steps} == {spec.observation_dim} == {dim}
     told = [float(np.frombuffer(step.observation, "<f4")[1]) for step in steps]  # after the speed
     if notify == "value":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
+from dataclasses import replace
 
 import msgspec
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from rtcore import channels
 from rtcore.channels import ACTION, AGENT, ENV_SERVER, STEP
 from rtcore.codec import seal
+from rtcore.messages import Action
 from tests.rtcore.bus_samples import (
     ENV,
     World,
@@ -96,3 +98,25 @@ def test_the_sender_refuses_a_message_of_another_type(world: World) -> None:
 def test_a_publisher_needs_a_plain_name(world: World, name: str) -> None:
     with pytest.raises(ValueError, match="name = "):
         world.bus(ENV_SERVER).publisher(STEP, name)
+
+
+def test_what_the_channels_check_refuses_is_rejected_like_what_does_not_decode(world: World) -> None:
+    def check(message: Action) -> None:
+        if message.tick > 10:
+            raise ValueError(f"tick = {message.tick}: nobody asked for it")
+
+    checked = replace(ACTION, check=check)
+    env, agent = world.bus(ENV_SERVER), world.bus(AGENT)
+    queue = env.queue(checked, ENV)
+    for tick in (11, 3):
+        world.inject(channels.ACTION.key_for(ENV), seal(msgspec.msgpack.encode(action(tick=tick))))
+    got: list[int] = []
+
+    def arrived() -> bool:
+        got.extend(one.message.tick for one in queue.drain())
+        return bool(got)
+
+    assert eventually(arrived)
+    assert got == [3]
+    assert env.rejected() == {"action": 1}
+    assert agent.rejected() == {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -221,3 +222,26 @@ def test_on_the_real_clock_a_stop_from_another_thread_ends_a_wait_of_seconds() -
     assert list(pacer.ticks(stop)) == []
     timer.join()
     assert time.monotonic() - began < 0.03 + 0.25 + 0.2  # the promise, and a busy machine's delay
+
+
+def test_a_later_life_begins_in_the_middle() -> None:
+    """D_7 = 5700; nothing before it is waited for, skipped or counted."""
+    clock = VirtualClock(5_650)
+    pacer = Pacer(clock, t0_ns=T0, period_ns=PERIOD, first_index=7, end_index=9)
+    assert list(pacer.ticks(Stop())) == [on_time(7), on_time(8)]
+    assert (pacer.executed, pacer.overruns, pacer.skipped_total) == (2, 0, 0)
+    assert list(Pacer(clock, t0_ns=T0, period_ns=PERIOD, first_index=9, end_index=9).ticks(Stop())) == []
+
+
+def test_t0_may_lie_before_the_clock_began() -> None:
+    pacer = Pacer(VirtualClock(0), t0_ns=-5_050, period_ns=PERIOD, first_index=51, end_index=53)
+    assert [tick.due_ns for tick in pacer.ticks(Stop())] == [50, 150]
+
+
+def test_the_heart_beats_at_every_tick_and_through_a_long_wait() -> None:
+    """A tick each 0.5 s: 3 slices of a wait, and the look at its end."""
+    clock, beats = VirtualClock(0), list[int]()
+    pacer = Pacer(clock, t0_ns=0, period_ns=500_000_000, end_index=3, beat=beats.append)
+    assert len(list(pacer.ticks(Stop()))) == 3
+    assert beats[0] == 0 and beats[-1] == 1_000_000_000
+    assert max(after - before for before, after in pairwise(beats)) <= SLICE_NS

@@ -16,7 +16,7 @@ from rtcore.config import EnvConfig, RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
-from rtcore.process import Reporter, background
+from rtcore.process import Reporter, _ledger, background
 from rtcore.run_dir import RunDir
 
 
@@ -77,3 +77,39 @@ def test_a_process_whose_parent_is_gone_ends_at_once(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode != 0
     assert time.monotonic() - begin < 20
+
+
+def test_what_was_rejected_is_counted_by_channel() -> None:
+    clock, hub = VirtualClock(5), MemoryHub()
+    bus, ledger = hub.bus(channels.LEARNER, clock), Ledger(channels.LEARNER, 1)
+    queue = bus.queue(channels.LOG, "env")
+    hub.inject(channels.LOG.key_for("env"), b"nonsense")
+    assert queue.drain() == []
+    last = Reporter(ledger, bus, clock, channels.LEARNER).snapshot()
+    assert last.counters == {"messages.rejected": 1, "messages.rejected.log": 1}
+
+
+def test_a_killed_process_leaves_its_counters_and_the_next_life_a_greater_number(tmp_path: Path) -> None:
+    run_dir = RunDir.create(tmp_path / "run", RunConfig(env=EnvConfig(id="pointmass", hz=50.0)))
+    lives: list[list[int]] = []
+    for _ in range(2):
+        command = [sys.executable, "-m", "agent_service", "--run", str(run_dir.path)]
+        with subprocess.Popen(command, stderr=subprocess.DEVNULL) as agent:
+            begin = time.monotonic()
+            while len(run_dir.read_final_stats()) == len(lives):
+                assert time.monotonic() < begin + 20 and agent.poll() is None
+                time.sleep(0.02)
+            agent.kill()
+        lives.append([stats.incarnation for stats in run_dir.read_final_stats()])
+    run_dir.remove_socket_dir()
+    assert lives[1] == sorted(lives[1]) and lives[1][:1] == lives[0] and len(set(lives[1])) == 2
+    assert [stats.final for stats in run_dir.read_final_stats()] == [False, False]
+
+
+def test_without_a_place_for_its_tally_a_process_lives_and_says_so(tmp_path: Path) -> None:
+    run_dir = RunDir(tmp_path / "none")
+    with _ledger(run_dir, channels.LEARNER, 1, VirtualClock(5)) as ledger:
+        ledger.count("learned")
+        stats = ledger.stats(6)
+    assert stats.counters == {"tally.unbacked": 1, "learned": 1}
+    assert [event.level for event in stats.events] == ["WARN"]

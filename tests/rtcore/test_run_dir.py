@@ -7,12 +7,15 @@ from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from rtcore import run_dir
 from rtcore.config import ConfigError, EnvConfig, RunConfig
 from rtcore.config_io import dump_toml, load_toml
+from rtcore.files import write_atomic
 from rtcore.messages import Stats
-from rtcore.run_dir import RunDir, default_run_path, latest, write_atomic
+from rtcore.run_dir import RunDir, default_run_path, latest
+from rtcore.tally import Tally
 
 CONFIG = RunConfig(preset="pointmass", seed=4, env=EnvConfig(id="pointmass", hz=100.0))
 
@@ -227,3 +230,28 @@ def test_latest_is_the_run_made_last(tmp_path: Path) -> None:
     os.utime(tmp_path / "z" / "run.toml", ns=(0, 10**18))
     tied = latest(tmp_path)
     assert tied is not None and tied.path == tmp_path / "z"
+
+
+def test_a_tally_raises_the_last_words_and_stands_for_those_that_were_never_said(tmp_path: Path) -> None:
+    run = RunDir.create(tmp_path / "one", CONFIG)
+    for incarnation in (9, 10):
+        with Tally.create(run.tally_path("env_server", incarnation)) as tally:
+            tally.set_together({"ticks": 5, "resets": 1})
+    run.write_final_stats(stats("env_server", 9, 7))
+    last, killed = run.read_final_stats()
+    assert last == replace(stats("env_server", 9, 7), counters={"ticks": 7, "resets": 1})
+    assert (killed.process, killed.incarnation, killed.final) == ("env_server", 10, False)
+    assert killed.counters == {"ticks": 5, "resets": 1}
+    run.tally_path("recorder", 1).write_bytes(b"torn")
+    assert [one.counters for one in run.read_final_stats()][2:] == [{}]
+
+
+def test_an_incarnation_is_greater_than_all_before_it(tmp_path: Path) -> None:
+    run = RunDir.create(tmp_path / "one", CONFIG)
+    assert run.next_incarnation("learner", 500) == 500
+    run.write_final_stats(stats("learner", 700, 1))
+    run.tally_path("learner", 710).touch()
+    run.tally_path("recorder", 900).touch()
+    (run.logs_dir / "learner-x.tally").touch()
+    assert run.next_incarnation("learner", 500) == 711  # the host's clock was set back
+    assert run.next_incarnation("learner", 800) == 800

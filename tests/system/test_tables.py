@@ -62,6 +62,20 @@ def test_a_real_run_reconciles(real: Path) -> None:
     assert summary["windows"] == [{"m": m, "t_m": 4 * m, "G": 2, "N": 2} for m in range(8)]
 
 
+def test_its_regret_is_of_every_tick(real: Path) -> None:
+    """Two units of 50 ticks in each phase of each window; what nobody answered in time is left out."""
+    summary = summary_of(real)
+    regret = summary["regret"]
+    assert summary["regret_missing"] is None
+    assert (regret["units"], regret["update_units"], regret["hold_units"]) == (32, 16, 16)
+    assert regret["ticks"] + regret["left_out_ticks"] == summary["transitions"]["produced"]
+    assert regret["left_out_ticks"] == summary["deadlines"]["missed"]
+    assert regret["per_unit"] > 0
+    assert regret["total"] == pytest.approx(regret["update"] + regret["hold"])
+    assert regret["worst_state"]["total"] > regret["total"]
+    assert regret["bounds"] is None and "npg" in regret["bounds_missing"]
+
+
 def test_its_recording_shows_phases_policies_and_every_tick(real: Path) -> None:
     recording, summary = real / "recording.rrd", summary_of(real)
     phases = spans(recording)

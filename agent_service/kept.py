@@ -1,0 +1,56 @@
+"""The newest policy that this host knows of, for an agent that starts again, maybe beside no learner.
+
+It is also the floor: what is older is refused, so nobody can bring an old policy back by replaying it.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rtcore.clock import Clock
+from rtcore.files import write_atomic
+from rtcore.ledger import Ledger
+from rtcore.messages import Policy
+from rtcore.run_dir import RunDir
+from rtcore.signing import Verifier
+from rtcore.weights import WeightsError
+
+
+class Kept:
+    """Two files: the learner's, where it is on this host, and otherwise the agent's own."""
+
+    def __init__(self, run_dir: RunDir, ledger: Ledger, clock: Clock, verifier: Verifier) -> None:
+        self._run_dir = run_dir
+        self._ledger = ledger
+        self._clock = clock
+        self._verifier = verifier
+
+    def newest(self) -> Policy | None:
+        """The newest one whose signature is right; another is refused, counted and reported."""
+        found = (self._run_dir.read_policy(), self._run_dir.read_adopted())
+        good = [policy for policy in found if policy is not None and self._is_right(policy)]
+        return max(good, key=lambda policy: policy.version, default=None)
+
+    def keep(self, policy: Policy) -> None:
+        """Write it down, unless the learner does; off the acting thread, it waits for the disk."""
+        if self._run_dir.policy_path.exists():
+            return
+        path = self._run_dir.adopted_path
+        try:
+            path.parent.mkdir(exist_ok=True)
+            write_atomic(path, msgspec.msgpack.encode(policy))
+        except OSError as error:
+            self._ledger.count("policy_file.errors")
+            self._say(f"policy {policy.version} not on disk: {error}")
+
+    def _is_right(self, policy: Policy) -> bool:
+        try:
+            self._verifier.check(policy)
+        except WeightsError as error:
+            self._ledger.count_together("policies.received", "policies.rejected")
+            self._say(f"policy {policy.version} from a file refused: {error}")
+            return False
+        return True
+
+    def _say(self, text: str) -> None:
+        self._ledger.event(self._clock.now_ns(), "WARN", text)

@@ -1,0 +1,124 @@
+"""How a life of the env server begins: whom it waits for, and where in the run it is.
+
+The first life sets T0. A later one goes on by it: at the tick that is due now, in the unit that it is now,
+with episodes that nobody has seen; the deadlines in between have passed, and are counted as `down`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from rtcore import channels, epoch
+from rtcore.bus import Bus
+from rtcore.clock import Clock
+from rtcore.config import RunConfig
+from rtcore.epoch import Epoch
+from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop
+from rtcore.run_dir import RunDir
+
+LEAD_NS = 100_000_000  # from announcing to the first tick, so that the spec is with everybody before step 0
+PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for in any case
+PEERS_POLL_S = 0.05
+# A later life finds the run's clock running: it waits as long as links need to come back, 1.2 s at worst.
+RETURN_WAIT_S = 1.2
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """Where a life learns of those before it.
+
+    Attributes:
+        run_dir: what they left; None: there are none, and none will follow.
+        wall_ns: Unix time.
+    """
+
+    run_dir: RunDir | None = None
+    wall_ns: Callable[[], int] = time.time_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """Where a life is in the run.
+
+    Attributes:
+        epoch: when the run began, on this boot's clock.
+        first_index: the life's first tick.
+        end_index: the tick after the run's last; None: it ends when stopped.
+        first_episode: the number of the life's first episode.
+        down: deadlines that passed while no env server lived, since the life before.
+    """
+
+    epoch: Epoch
+    first_index: int
+    end_index: int | None
+    first_episode: int = 0
+    down: int = 0
+
+
+def wait_for_peers(config: RunConfig, past: Past, bus: Bus, clock: Clock, ledger: Ledger, stop: Stop) -> None:
+    """Wait until agent and learner are there, and the recorder of a run that is recorded: whoever comes later
+    finds only the newest policy. `env.start_wait_s` at most, and where the run has begun already 1.2 s.
+    """
+    wait_s, run_dir = config.env.start_wait_s, past.run_dir
+    if run_dir is not None and epoch.read(run_dir.epoch_path) is not None:
+        wait_s = min(wait_s, RETURN_WAIT_S)
+    peers = PEERS | ({channels.RECORDER} if config.recorder.record else set())
+    limit_ns = clock.now_ns() + round(wait_s * 1e9)
+    while missing := peers - bus.alive():
+        now_ns = clock.now_ns()
+        ledger.beat(now_ns)
+        if now_ns >= limit_ns:
+            names = " and ".join(sorted(missing))
+            ledger.event(now_ns, "WARN", f"starting without {names} after {wait_s:g} s")
+            return
+        if stop.wait(min(PEERS_POLL_S, (limit_ns - now_ns) / 1e9)):
+            return
+
+
+def begin(config: RunConfig, past: Past, clock: Clock, ledger: Ledger, *, tick_ns: int) -> Beginning:
+    """Find out where in the run this life begins.
+
+    Raises:
+        ConfigError: the run's beginning cannot be read.
+    """
+    num_ticks = max(1, round(config.duration_s * 1e9 / tick_ns))
+    end_index = num_ticks if config.duration_s > 0 else None
+    run_dir, now_ns, unix_ns = past.run_dir, clock.now_ns(), past.wall_ns()
+    boot_id = "" if run_dir is None else epoch.this_boot()
+    proposed = Epoch(t0_ns=now_ns + LEAD_NS, wall_t0_ns=unix_ns + LEAD_NS, boot_id=boot_id)
+    if run_dir is None:
+        return Beginning(proposed, 0, end_index)
+    settled, problem = epoch.settle(run_dir.epoch_path, proposed, now_ns=now_ns, wall_ns=unix_ns)
+    if problem is not None:
+        text = f"the run's beginning is not on disk ({problem}): a later env server would begin anew"
+        ledger.event(now_ns, "WARN", text)
+    if settled.lives == 1:
+        return Beginning(settled, 0, end_index)
+    lives = [stats.counters for stats in run_dir.read_final_stats() if stats.process == channels.ENV_SERVER]
+    return go_on(settled, lives, now_ns=clock.now_ns(), tick_ns=tick_ns, end_index=end_index)
+
+
+def go_on(
+    settled: Epoch, lives: Sequence[Mapping[str, int]], *, now_ns: int, tick_ns: int, end_index: int | None
+) -> Beginning:
+    """Where a later life begins, at the first deadline at or after `now_ns` and the lead. Pure.
+
+    Args:
+        settled: when the run began.
+        lives: the counters of the earlier lives; those that began have `lives` = 1.
+        now_ns: the present.
+        tick_ns: the control period.
+        end_index: see `Beginning`.
+    """
+    first_index = max(0, -(-(now_ns + LEAD_NS - settled.t0_ns) // tick_ns))
+    if end_index is not None:
+        first_index = min(first_index, end_index)
+    begun = [counters for counters in lives if counters.get("lives", 0)]
+    accounted = sum(counters.get(name, 0) for counters in begun for name in ("ticks", "skipped", "down"))
+    episodes = sum(counters.get("resets", 0) for counters in begun)
+    # A life of which nothing is left had no more episodes than ticks, so these are nobody's either.
+    first_episode = episodes if len(begun) >= settled.lives - 1 else first_index
+    return Beginning(settled, first_index, end_index, first_episode, max(0, first_index - accounted))

@@ -1,0 +1,53 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a file so that, whatever happens, there is the old one or the new one, whole and on the disk.
+
+    Raises:
+        OSError: it could not be written; the old one is untouched.
+    """
+    with _written_aside(path, data) as temporary:
+        temporary.replace(path)
+    _keep_names(path.parent)
+
+
+def write_once(path: Path, data: bytes) -> None:
+    """Like `write_atomic`, for a file that must not be there yet: of several writers one succeeds.
+
+    Raises:
+        FileExistsError: it is there.
+        OSError: it could not be written.
+    """
+    with _written_aside(path, data) as temporary:
+        path.hardlink_to(temporary)  # unlike a rename it does not replace
+    _keep_names(path.parent)
+
+
+@contextmanager
+def _written_aside(path: Path, data: bytes) -> Iterator[Path]:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _keep_names(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)  # the rename itself
+    finally:
+        os.close(descriptor)
