@@ -289,4 +289,4 @@ class ConfigError(ValueError):
 
     def __init__(self, name: str, value: object, allowed: str) -> None:
         super().__init__(f"{name} = {value!r}: {allowed}")
-        self.name = name
+        self.name, self.value, self.allowed = name, value, allowed

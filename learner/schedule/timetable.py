@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from learner.theory.optimum import HoldProblem, best_split
-from rtcore.config import BoundConfig, ScheduleConfig
+from rtcore.config import BoundConfig, ConfigError, ScheduleConfig
 from rtcore.windows import FixedSchedule, Schedule, Window, make_schedule
 
 Choose = Callable[[ScheduleConfig, int], int]
@@ -133,7 +133,11 @@ def best(config: ScheduleConfig) -> FixedSchedule:
     Raises:
         ConfigError: the constants do not belong together.
     """
-    split = best_split(HoldProblem(window=config.l_f, **asdict(config.bound)))
+    try:
+        split = best_split(HoldProblem(window=config.l_f, **asdict(config.bound)))
+    except ConfigError as error:
+        name = f"learner.schedule.bound.{error.name}"
+        raise ConfigError(name, error.value, error.allowed) from error
     return FixedSchedule(config.l_f, max(split.update, 1) / config.l_f)
 
 

@@ -116,7 +116,7 @@ def test_optimal_is_the_bound_s() -> None:
 
 
 def test_optimal_needs_constants_that_belong_together() -> None:
-    with pytest.raises(ConfigError, match="eta tau must be below 1"):
+    with pytest.raises(ConfigError, match=r"^learner.schedule.bound.eta = 2.0: eta tau must be below 1"):
         best(ScheduleConfig(kind="optimal", bound=BoundConfig(eta=2.0, tau=1.0)))
 
 
