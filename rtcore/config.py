@@ -139,8 +139,8 @@ class BoundConfig:
     c_45: float = 1.0  # C_4 + C_5, what a change of the world costs
     eta: float = 0.1  # step size and
     tau: float = 0.1  # entropy weight of the policy's update
-    alpha_1: float = 1.0  # growth of the variation budget per unit, in the update
-    alpha_2: float = 1.0  # and in the hold
+    alpha_1: float = 1.05  # growth of the variation budget per unit, in the update; above 1 (Assumption 1)
+    alpha_2: float = 1.05  # and in the hold
     b_1: float = 1.0  # B^max of the update
     b_2: float = 1.0  # and of the hold
 
@@ -156,8 +156,7 @@ class ScheduleConfig:
     t_m: tuple[int, ...] = ()  # window starts in units, explicit schedule; the first is 0
     g_m: tuple[int, ...] = ()  # update units of each, explicit schedule
     least_update: int = 1  # auto, auto_bound: units of a window that are updated in whatever is predicted
-    least_gain: float = 0.05  # auto: hold only if that is predicted to save this share of the regret;
-    # docs/headline.md has how it was picked
+    least_gain: float = 0.05  # auto: hold only if that is predicted to save this share (docs/headline.md)
     rate: float = 0.1  # auto with fsac: share of the way to its target that a unit takes the policy
     bound: BoundConfig = field(default_factory=BoundConfig)
 

@@ -154,7 +154,7 @@ RULES: dict[str, Rule] = {
     "learner.schedule.least_gain": _number("[0, 1]"),
     **{f"learner.schedule.bound.{name}": _number("[0, 1e20]") for name in ("c_1", "c_45", "b_1", "b_2")},
     **{f"learner.schedule.bound.{name}": _number("(0, 1e20]") for name in ("eta", "tau")},
-    **{f"learner.schedule.bound.{name}": _number("(0, 1e20]") for name in ("alpha_1", "alpha_2")},
+    **{f"learner.schedule.bound.{name}": _number("(1, 1e20]") for name in ("alpha_1", "alpha_2")},
     "learner.forecast.l_p": _whole(1),
     "learner.forecast.every": _whole(1),
     "learner.forecast.degree": _whole(1, 20),
