@@ -133,6 +133,8 @@ def test_no_field_takes_anything() -> None:
         ("env.drift.at", "soon", "must be in [-1e12, 1e12], or 'random'"),
         ("env.physics.gravity.rate", 0.0, "must be in (0, 1]"),
         ("learner.forecast.horizon", -1.0, "must be in [0, inf), or 'replay', or 'window'"),
+        ("learner.schedule.least_gain", 1.5, "must be in [0, 1]"),
+        ("learner.schedule.bound.alpha_1", 1.0, "must be in (1, 1e20]"),
         ("learner.forecast.shrink", -1.0, "must be in [0, inf)"),
         ("learner.forecast.trust", "judge", "must be one of 'always', 'judged', 'never'"),
         ("recorder.record", 1, "must be true or false"),
