@@ -5,7 +5,8 @@
 By turns: the env server, the agent and a learner at its preset's settings, without a recorder; and the
 same with a recorder that writes the file in full detail and streams to a viewer. The viewer has no window:
 it is Rerun's own client saving what it is sent, at the niceness that `tenuto run` gives to viewers, so it
-receives as a browser's does but draws nothing.
+receives as a browser's does but draws nothing. Besides, what a row costs the recorder: its processor time
+once it serves viewers, over the rows that it wrote.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,13 +58,13 @@ class SavingViewer:
         self._into = into
         self._process: subprocess.Popen[bytes] | None = None
 
-    def poll(self) -> None:
-        """Connect, once, as soon as somebody listens."""
+    def poll(self) -> bool:
+        """Connect, once, as soon as somebody listens; says whether it has."""
         if self._process is not None:
-            return
+            return True
         with socket.socket() as probe:
             if probe.connect_ex((HOST, self._port)):
-                return
+                return False
         home = self._into.with_suffix(".home")
         switch_off_statistics(home)
         self._process = subprocess.Popen(
@@ -73,6 +75,7 @@ class SavingViewer:
             stderr=subprocess.DEVNULL,
             process_group=0,
         )  # fmt: skip
+        return True
 
     def close(self) -> None:
         """End it, and the program that Python started for it."""
@@ -87,6 +90,36 @@ class SavingViewer:
         return self._into.stat().st_size if self._into.exists() else 0
 
 
+class ProcessorTime:
+    """Of this process's child that runs a module, as last seen: call `poll` until it ends."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module.encode()
+        self._stat: Path | None = None
+        self.seconds = 0.0
+        self.begun_at: float | None = None
+
+    def begin(self) -> None:
+        """Count from here, once."""
+        if self.begun_at is None:
+            self.begun_at = self.seconds
+
+    def poll(self) -> None:
+        """Find the child if need be, and read its account."""
+        with contextlib.suppress(OSError):  # it has ended
+            if self._stat is None:
+                self._stat = next(self._found(), None)
+            if self._stat is not None:
+                fields = self._stat.read_text().rpartition(")")[2].split()
+                self.seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def _found(self) -> Iterator[Path]:
+        for task in Path("/proc/self/task").iterdir():
+            for child in (task / "children").read_text().split():
+                if self._module in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+                    yield Path(f"/proc/{child}/stat")
+
+
 def measure(arm: str, hz: float, arguments: Arguments) -> Outcome:
     """One run of one arm."""
     config = world(arguments.world, hz=hz, seconds=arguments.seconds, rt=arguments.rt)
@@ -95,14 +128,22 @@ def measure(arm: str, hz: float, arguments: Arguments) -> Outcome:
     port = free_port()
     recorder = replace(config.recorder, record=True, detail="full", view="web", port=port)
     with tempfile.TemporaryDirectory() as directory:
-        viewer = SavingViewer(port, Path(directory) / "seen.rrd")
+        viewer, spent = SavingViewer(port, Path(directory) / "seen.rrd"), ProcessorTime(channels.RECORDER)
+
+        def poll() -> None:
+            spent.poll()
+            if viewer.poll():
+                spent.begin()
+
         with closing(viewer):
             found = run_system(
-                replace(config, recorder=recorder), (*LEARNING, channels.RECORDER), on_poll=viewer.poll
+                replace(config, recorder=recorder), (*LEARNING, channels.RECORDER), on_poll=poll
             )
             if not viewer.received_bytes:
                 raise BenchmarkError("the viewer received nothing")
             more: dict[str, Any] = {**found.more, "viewer_bytes": viewer.received_bytes}
+    spent_s = spent.seconds - (spent.begun_at or 0.0)
+    more["recorder_cpu_us_per_row"] = spent_s * 1e6 / max(1, more["recorder"]["rows"])
     return replace(found, more=more)
 
 
@@ -119,6 +160,8 @@ def main(arguments: Arguments) -> None:
     for hz in arguments.hz:
         found = compare(lambda arm, hz=hz: measure(arm, hz, arguments), arguments.rounds)  # type: ignore[misc]
         print("\n" + table(f"recorder and stream, {hz:g} Hz", found), flush=True)
+        per_row = sorted(run["more"]["recorder_cpu_us_per_row"] for run in found["runs"][WITH])
+        print(f"processor time per row: {' '.join(f'{one:.1f}' for one in per_row)} us", flush=True)
         rates.append({"hz": hz, **found})
         write_result("recorder_cost", arguments, PACKAGES, {"rates": rates})
 

@@ -91,6 +91,7 @@ def _right(plots: _Plots, spec: Spec) -> list[Any]:
         rrb.Tabs(
             plots.lines("Losses", "/learner/loss/**", legend=True),
             plots.lines("Forecast", FORECAST, legend=True),
+            plots.lines("Window, units", "/learner/schedule/update", "/learner/schedule/hold", legend=True),
             plots.lines("Mean Q", "/learner/q_mean"),
             *([] if spec.states else [plots.lines("Temperature", "/learner/alpha")]),  # tables have none
             plots.lines("Entropy", "/learner/entropy"),

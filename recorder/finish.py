@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 TIMEOUT_S = 120.0  # measured: 1.3 s for 23 MB in 15 000 chunks, so an hour at 50 Hz stays below 20 s
@@ -31,9 +32,25 @@ def parts_of(recording: Path) -> list[Path]:
     return sorted(recording.parent.glob(f"{recording.stem}.part*.rrd"))
 
 
-def set_aside(recording: Path) -> Path | None:
-    """Rename what an earlier incarnation wrote, so that it is not overwritten; None if it wrote nothing."""
-    if not recording.exists() or recording.stat().st_size == 0:
+def set_aside(recording: Path, counts: tuple[int, int] | None = None) -> Path | None:
+    """Rename what an earlier incarnation wrote, so that it is not overwritten; None if it wrote nothing.
+
+    Args:
+        recording: the file.
+        counts: (inode, length) of the part that counts; what that file has beyond is cut off.
+
+    Raises:
+        OSError: the disk does not let it.
+    """
+    _settle(recording)
+    if not recording.exists():
+        return None
+    found = recording.stat()
+    length = found.st_size
+    if counts is not None and found.st_ino == counts[0] and length > counts[1]:
+        length = counts[1]
+        os.truncate(recording, length)
+    if length == 0:
         return None
     part = recording.with_name(f"{recording.stem}.part{len(parts_of(recording)):03d}.rrd")
     recording.rename(part)
@@ -44,24 +61,45 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
     """Replace `recording` by its compacted, complete and verified form, in one step.
 
     Takes in the parts of earlier incarnations, and repairs what a kill -9 left behind: a missing footer,
-    a torn last chunk.
+    a torn last chunk. Killed itself, at any instant, it can be called again.
 
     Raises:
-        FinishError: it did not work; `recording` and its parts are untouched.
+        FinishError: it did not work; no row is lost, nor there twice.
     """
-    parts = parts_of(recording)
-    finished = recording.with_name(f".{recording.stem}.finishing.rrd")
+    working = recording.with_name(f".{recording.stem}.finishing.rrd")
     try:
-        sources = [_checked(path) for path in [*parts, recording]]
-        run_cli(["rrd", "optimize", *map(str, sources), "-o", str(finished)], timeout_s=timeout_s)
-        run_cli(["rrd", "verify", str(finished)], timeout_s=timeout_s)
-        finished.replace(recording)
+        _settle(recording)
+        sources = [_checked(path) for path in [*parts_of(recording), recording] if not _empty(path)]
+        if not sources:
+            raise FinishError(f"{recording.name}: nothing was written")
+        run_cli(["rrd", "optimize", *map(str, sources), "-o", str(working)], timeout_s=timeout_s)
+        run_cli(["rrd", "verify", str(working)], timeout_s=timeout_s)
+        working.rename(_finished(recording))
+        _settle(recording)
     except OSError as error:
         raise FinishError(f"{recording.name}: {error}") from error
     finally:
-        finished.unlink(missing_ok=True)
-    for part in parts:
-        part.unlink()
+        with suppress(OSError):
+            working.unlink(missing_ok=True)
+
+
+def _finished(recording: Path) -> Path:
+    return recording.with_name(f".{recording.stem}.finished.rrd")
+
+
+def _settle(recording: Path) -> None:
+    """From the moment at which the finished file has its name, it stands for the parts and the recording:
+    remove them, and put it in their place. Does nothing where there is none.
+    """
+    finished = _finished(recording)
+    if finished.exists():
+        for part in parts_of(recording):
+            part.unlink()
+        finished.replace(recording)
+
+
+def _empty(path: Path) -> bool:
+    return not path.exists() or path.stat().st_size == 0
 
 
 def _checked(path: Path) -> Path:

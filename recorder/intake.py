@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from recorder.place import Place
 from recorder.telemetry import TelemetryRows
 from rtcore import channels
 from rtcore.bus import Bus
@@ -12,6 +13,8 @@ LOG_CAPACITY = 2_000  # batches: 100 s of a recorder that hangs, 50 MB at 1 kHz
 STATS_CAPACITY = 2_000
 POLICY_CAPACITY = 64  # a few hundred kB each
 WINDOW_CAPACITY = 2_000
+# Whose last words are waited for. The launcher's come after the recorder's end.
+WAITED_FOR = tuple(name for name in channels.PROCESSES if name != channels.RECORDER)
 
 
 class Intake:
@@ -26,6 +29,16 @@ class Intake:
         self._telemetry = telemetry
         self._speaking: set[str] = set()  # processes heard whose final stats are still to come
         self.placements: dict[str, str] = {}  # process -> what the system granted it
+
+    def go_on_from(self, place: Place) -> None:
+        """Begin where an earlier life of the recorder ended. Call it before anything is taken."""
+        self._log.go_on_from(place.log)
+        self.placements = dict(place.placements)
+
+    @property
+    def position(self) -> tuple[int, int] | None:
+        """(incarnation, seq) of the step that is due next; None before the first step."""
+        return self._log.stream.position
 
     @property
     def gaps(self) -> int:
@@ -75,7 +88,7 @@ class Intake:
         self._telemetry.stats(stats)
         if stats.final:
             self._speaking.discard(stats.process)
-        elif stats.process != channels.RECORDER:
+        elif stats.process in WAITED_FOR:
             self._speaking.add(stats.process)
         prefix = f"{stats.process}: "  # every process's first event: its scheduling and cores
         for event in stats.events:

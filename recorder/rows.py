@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
+EPISODES = 64  # telemetry is seconds old at most, so even of 0.2 s they are enough
+
 
 @dataclass(frozen=True, slots=True)
 class Index:
@@ -86,15 +88,26 @@ class Timeline:
     """Turns monotonic stamps into places on the five timelines.
 
     T0 is the first env server's: the timeline goes on when an env server comes back with a later one.
+
+    Args:
+        spec: says T0, and how long a tick and a unit are.
+        episodes: the newest ones that were remembered before; see `episodes`.
     """
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(self, spec: Spec, episodes: Sequence[tuple[int, int]] = ()) -> None:
         self._t0_ns = spec.t0_ns
         self._wall_t0_ns = spec.wall_t0_ns
         self._tick_ns = spec.tick_ns
         self._unit_ns = spec.unit_ns
-        self._episode_starts_ns: list[int] = []  # run time of each episode's first step seen, rising
-        self._episodes: list[int] = []
+        self._episodes = [episode for episode, _ in episodes]
+        # Run time of each one's first step seen, rising.
+        self._episode_starts_ns = [at_ns for _, at_ns in episodes]
+
+    @property
+    def episodes(self) -> list[tuple[int, int]]:
+        """(number, run time in ns of its first step seen) of the newest 64 episodes, in order."""
+        newest = slice(-EPISODES, None)
+        return list(zip(self._episodes[newest], self._episode_starts_ns[newest], strict=True))
 
     def remember(self, steps: Sequence[Step]) -> None:
         """Learn where episodes begin, from steps in order."""

@@ -52,6 +52,8 @@ LOOKS: dict[str, Look] = {
     },
     "/agent/policy_version": Look(("acting",), (ORANGE,), "Steps"),
     "/learner/published_version": Look(("published",), (BLUE,), "Dots"),
+    "/learner/schedule/update": Look(("update G",), (BLUE,), "Steps"),
+    "/learner/schedule/hold": Look(("hold N",), (ORANGE,), "Steps"),
     "/learner/loss/critic": Look(("critic",), (BLUE,)),
     "/learner/loss/actor": Look(("actor",), (ORANGE,)),
     "/learner/loss/alpha": Look(("temperature",), (PURPLE,)),

@@ -1,17 +1,21 @@
 """From stats, phases and policies to rows: what the learner did and what everybody said. Pure.
 
-Messages may come twice (retained ones, and what stats repeat); each counts once.
+Messages may come twice (retained ones, and what stats repeat); each counts once, over all lives of the
+recorder.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections import defaultdict
 
 import numpy as np
 
+from recorder.place import Told
 from recorder.rows import Lines, Rows, Scalars, States, Timeline
+from recorder.seen import Seen
 from rtcore.channels import LEARNER
-from rtcore.messages import Event, Level, Policy, Stats, WindowNotice
+from rtcore.messages import Level, Policy, Stats, WindowNotice
 
 FORECAST = "/learner/forecast"
 
@@ -25,22 +29,39 @@ class TelemetryRows:
         self._forecasts: list[tuple[int, dict[str, float]]] = []
         self._phases: list[tuple[int, str]] = []
         self._versions: list[tuple[int, int]] = []
-        self._stats_seen: dict[tuple[str, int], set[int]] = defaultdict(set)
-        self._events_seen: set[tuple[str, Event]] = set()
-        self._notices_seen: set[WindowNotice] = set()
-        self._versions_seen: set[tuple[int, int]] = set()
+        self._stats_seen: defaultdict[str, Seen] = defaultdict(Seen)
+        self._events_seen: defaultdict[str, Seen] = defaultdict(Seen)
+        self._notices_seen = Seen()
+        self._policies_seen = Seen()
         self.forecast_names: list[str] = []  # series of `FORECAST`, in the order of the row; grows
+
+    def go_on_from(self, told: Told) -> None:
+        """Begin where an earlier life of the recorder ended. Call it before anything is taken."""
+        self._stats_seen.update({name: Seen(mark) for name, mark in told.stats.items()})
+        self._events_seen.update({name: Seen(mark) for name, mark in told.events.items()})
+        self._notices_seen = Seen(told.notices)
+        self._policies_seen = Seen(told.policies)
+        self.forecast_names = list(told.forecast_names)
+
+    @property
+    def told(self) -> Told:
+        """What was taken so far, by this life and earlier ones."""
+        return Told(
+            {name: seen.mark() for name, seen in self._stats_seen.items()},
+            {name: seen.mark() for name, seen in self._events_seen.items()},
+            self._notices_seen.mark(),
+            self._policies_seen.mark(),
+            list(self.forecast_names),
+        )
 
     def stats(self, stats: Stats) -> None:
         """Take a ledger: its events, the learner's gauges, and phases whose notice was lost."""
-        seen = self._stats_seen[stats.process, stats.incarnation]
-        if stats.seq in seen:
+        if not self._stats_seen[stats.process].add(stats.at_ns, stats.seq):
             return
-        seen.add(stats.seq)
+        seen = self._events_seen[stats.process]
         prefix = f"{stats.process}: "  # some name themselves
         for event in stats.events:
-            if (stats.process, event) not in self._events_seen:
-                self._events_seen.add((stats.process, event))
+            if seen.add(event.at_ns, zlib.crc32(event.text.encode())):
                 self.line(event.at_ns, event.level, f"[{stats.process}] {event.text.removeprefix(prefix)}")
         for notice in stats.windows:
             self.window(notice)
@@ -49,9 +70,9 @@ class TelemetryRows:
 
     def window(self, notice: WindowNotice) -> None:
         """Take the start of a phase."""
-        if notice in self._notices_seen:
+        number = (notice.window << 2) + 2 * (notice.phase == "hold") + (notice.reason == "operator")
+        if not self._notices_seen.add(notice.at_ns, number):
             return
-        self._notices_seen.add(notice)
         self._phases.append((notice.at_ns, notice.phase))
         if notice.reason == "operator":
             what = "holds the policy" if notice.phase == "hold" else "resumes the schedule"
@@ -59,9 +80,7 @@ class TelemetryRows:
 
     def policy(self, policy: Policy) -> None:
         """Take a published iterate."""
-        key = (policy.version, policy.created_ns)
-        if key not in self._versions_seen:
-            self._versions_seen.add(key)
+        if self._policies_seen.add(policy.created_ns, policy.version):
             self._versions.append((policy.created_ns, policy.version))
 
     def line(self, at_ns: int, level: Level, text: str) -> None:

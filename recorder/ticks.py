@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from math import nan
 
 import numpy as np
 
+from recorder.place import Carried
 from recorder.rows import Floats, Index, Rows, Scalars, Timeline
 from rtcore.config import EnvConfig
 from rtcore.messages import Spec, Step
@@ -22,13 +24,21 @@ class TickRows:
         timeline: places rows on the timelines.
         speed_per_m: what one metre travelled along the first coordinate within one tick is worth in the
             units of the drift (k_f / native period in s); None: the drift is no speed.
+        carried: from the step before the first one; None: there is none.
     """
 
-    def __init__(self, timeline: Timeline, speed_per_m: float | None = None) -> None:
+    def __init__(
+        self, timeline: Timeline, speed_per_m: float | None = None, carried: Carried | None = None
+    ) -> None:
         self._timeline = timeline
         self._speed_per_m = speed_per_m
-        self._previous: Step | None = None
-        self._return: float | None = None  # None: a step of this episode never came
+        self._previous = carried
+        self._return = None if carried is None else carried.episode_return
+
+    @property
+    def carried(self) -> Carried | None:
+        """From the last step; None: there was none."""
+        return self._previous
 
     def rows(self, steps: Sequence[Step]) -> list[Rows]:
         """Rows of consecutive steps, continuing those of the previous call; at least one step."""
@@ -81,9 +91,10 @@ class TickRows:
                 self._return += step.reward
                 if step.terminated or step.truncated:
                     returns[i] = self._return
+            first = nan if self._speed_per_m is None else _first(step)
             if follows and step.episode_tick > 0 and self._speed_per_m is not None and self._previous:
-                speed[i] = (_first(step) - _first(self._previous)) * self._speed_per_m
-            self._previous = step
+                speed[i] = (first - self._previous.first) * self._speed_per_m
+            self._previous = Carried(step.incarnation, step.seq, first, self._return)
         return speed, returns
 
     def _follows(self, step: Step) -> bool:

@@ -6,6 +6,7 @@ import rerun as rr
 
 from recorder.card import run_card
 from recorder.dashboard import dashboard
+from recorder.place import Place, Told
 from recorder.rows import Rows, Timeline
 from recorder.scene import Scene, drawn, drawn_every, positions
 from recorder.sinks import Recording
@@ -15,12 +16,23 @@ from recorder.ticks import TickRows, speed_per_m
 from rtcore.config import RunConfig
 from rtcore.messages import Spec, Step
 
+START = Place()
+
 
 class RunWriter:
-    """Writes steps and telemetry of a run whose world is known; says first how everything looks."""
+    """Writes steps and telemetry of a run whose world is known; says first how everything looks.
+
+    `place` is where an earlier life of the recorder ended; its rows are in a file of their own.
+    """
 
     def __init__(
-        self, config: RunConfig, run: str, recording: Recording, spec: Spec, scene: Scene | None
+        self,
+        config: RunConfig,
+        run: str,
+        recording: Recording,
+        spec: Spec,
+        scene: Scene | None,
+        place: Place = START,
     ) -> None:
         self._config = config
         self._run = run
@@ -28,9 +40,9 @@ class RunWriter:
         self._spec = spec
         self._scene = scene
         self._every = drawn_every(spec)
-        self._timeline = Timeline(spec)
+        self._timeline = Timeline(spec, place.episodes)
         scale = speed_per_m(spec, config.env)
-        self._ticks = TickRows(self._timeline, scale)
+        self._ticks = TickRows(self._timeline, scale, place.carried)
         self._placements: dict[str, str] | None = None  # as the run card has them
         self._forecast_names: list[str] = []
         self._looks = static_looks(drift_is_speed=scale is not None)  # of entities without rows yet
@@ -52,6 +64,10 @@ class RunWriter:
             self._recording.static(FORECAST, *looks(forecast_look(self._forecast_names)))
         for rows in tables:
             self._write(rows)
+
+    def place(self, log: tuple[int, int] | None, told: Told) -> Place:
+        """How far the recording has got, with all that was written; `log` and `told` say what that was."""
+        return Place(log, self._ticks.carried, self._timeline.episodes, self._placements or {}, told)
 
     def _write(self, rows: Rows) -> None:
         for archetype in self._looks.pop(rows.entity, []):

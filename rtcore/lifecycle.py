@@ -1,8 +1,7 @@
-"""How a process ends in order, and where it writes what it has to say."""
+"""How a process ends in order, and says no more than can be read."""
 
 from __future__ import annotations
 
-import json
 import logging
 import mmap
 import os
@@ -13,13 +12,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
-from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 
 from rtcore import libc
-
-LEVEL_NAMES = {"WARNING": "WARN", "CRITICAL": "ERROR"}  # as in messages.Level
 
 
 class Stop:
@@ -169,74 +164,6 @@ def die_with_parent(parent_pid: int | None = None) -> bool:
     if parent_pid is not None and os.getppid() != parent_pid:
         os.kill(os.getpid(), signal.SIGTERM)
     return True
-
-
-class JsonLines(logging.Formatter):
-    """One JSON object a line: ts (UTC), mono_ns, level, process, logger, text and, if any, exception."""
-
-    def __init__(self, process: str) -> None:
-        super().__init__()
-        self._process = process
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line, without its end."""
-        line = {
-            "ts": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-            "mono_ns": time.monotonic_ns(),
-            "level": LEVEL_NAMES.get(record.levelname, record.levelname),
-            "process": self._process,
-            "logger": record.name,
-            "text": record.getMessage(),
-        }
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line)
-
-
-class LogFile:
-    """What `log_to_file` set up. Leaving the `with` block, or `close`, takes it down again."""
-
-    def __init__(self, handlers: tuple[logging.Handler, ...], previous_level: int) -> None:
-        self._handlers = handlers
-        self._previous_level = previous_level
-
-    def close(self) -> None:
-        """Stop logging there and close the file. A second close does nothing."""
-        root = logging.getLogger()
-        for handler in self._handlers:
-            root.removeHandler(handler)
-            handler.close()
-        if self._handlers:
-            root.setLevel(self._previous_level)
-        self._handlers = ()
-
-    def __enter__(self) -> LogFile:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-def log_to_file(path: Path, process: str, *, level: int = logging.INFO) -> LogFile:
-    """Send the process's log to `path` as JSON lines, and warnings and errors to stderr as well.
-
-    Works from the call on; closing the result is for those who log elsewhere afterwards. The file is
-    appended to, a line at a time, so that the incarnations of one process share it.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lines = logging.FileHandler(path, mode="a", encoding="utf-8")  # flushes after each record
-    lines.setFormatter(JsonLines(process))
-    console = logging.StreamHandler()
-    console.setLevel(logging.WARNING)
-    console.setFormatter(logging.Formatter(f"{process}: %(levelname)s: %(message)s"))
-    root = logging.getLogger()
-    handle = LogFile((lines, console), root.level)
-    root.setLevel(level)
-    root.addHandler(lines)
-    root.addHandler(console)
-    return handle
 
 
 class RateLimited:

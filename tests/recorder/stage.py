@@ -162,12 +162,22 @@ class Stage:
 
 def set_stage(tmp_path: Path, *, config: RunConfig = CONFIG, **recorder: Any) -> Stage:
     config = replace(config, recorder=RecorderConfig(**recorder))
-    run_dir = RunDir.create(tmp_path / "runs" / "r1", config)
+    path = tmp_path / "runs" / "r1"
+    run_dir = RunDir.open(path) if path.exists() else RunDir.create(path, config)
     clock, hub = VirtualClock(T0 - 2 * UNIT), MemoryHub()
     ledger = Ledger(channels.RECORDER, clock.now_ns())
     bus = hub.bus(channels.RECORDER, clock)
     service = RecorderService(config, run_dir, bus, clock, ledger)
     return Stage(run_dir, config, clock, ledger, service, hub)
+
+
+def come_back(stage: Stage) -> Stage:
+    """The next life of the stage's recorder, which has been killed."""
+    clock, hub = stage.clock, stage.hub
+    ledger = Ledger(channels.RECORDER, clock.now_ns())
+    bus = hub.bus(channels.RECORDER, clock)
+    service = RecorderService(stage.config, stage.run_dir, bus, clock, ledger)
+    return Stage(stage.run_dir, stage.config, clock, ledger, service, hub)
 
 
 def run(stage: Stage, steps: list[Step]) -> None:

@@ -15,7 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from recorder import reading
+from recorder.disk import RecordingFile
 from recorder.finish import switch_off_statistics
+from recorder.place import Place
 from recorder.rows import Index, Rows, Scalars
 from recorder.sinks import FLUSH_S, live_url, open_recording, payload_columns, time_columns
 from rtcore.monotonic import MonotonicClock
@@ -112,7 +114,8 @@ def readable(path: Path) -> list[int]:
 
 def test_a_stalled_viewer_is_dropped_for_a_while_and_the_file_goes_on(tmp_path: Path) -> None:
     port, clock = free_port(), MonotonicClock()
-    recording = open_recording(tmp_path / "recording.rrd", "r1", clock, port)
+    file = RecordingFile(tmp_path / "recording.rrd", tmp_path / "place", clock)
+    recording = open_recording(file, "r1", clock, port)
     live = recording.live
     assert live is not None
     recording.write(table(0))
@@ -135,6 +138,7 @@ def test_a_stalled_viewer_is_dropped_for_a_while_and_the_file_goes_on(tmp_path: 
         begin = time.monotonic()
         for number in range(1, 101):
             recording.write(table(number))
+            assert recording.sync(Place())
             assert live.pump()
         assert live.dropped == 1000
         os.kill(process, signal.SIGCONT)

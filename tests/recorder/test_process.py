@@ -52,6 +52,30 @@ def test_it_records_until_sigterm_and_leaves_a_finished_file(tmp_path: Path) -> 
     assert any(text.startswith("[recorder] ") for text in texts)  # where it runs
 
 
+def test_killed_while_the_env_server_goes_on_it_comes_back_to_every_step_once(tmp_path: Path) -> None:
+    run_dir = RunDir.create(tmp_path / "r1", RunConfig(recorder=RecorderConfig()))
+    clock = MonotonicClock()
+    t0 = clock.now_ns()
+    steps = [make_step(seq, incarnation=1, due_ns=t0 + seq * 20_000_000) for seq in range(120)]
+    with open_bus(channels.ENV_SERVER, run_dir.run_name, run_dir.socket_dir(), clock=clock) as bus:
+        bus.publisher(channels.SPEC, "env0").put(msgspec.structs.replace(SPEC, t0_ns=t0, incarnation=1))
+        log = bus.publisher(channels.LOG, "env0")
+        log.put(StepBatch(steps=steps[:40]))
+        with running(run_dir) as process:
+            wait_for_rows(bus)
+            log.put(StepBatch(steps=steps[40:60]))  # it may have taken them, written them, or neither
+            process.kill()
+            assert process.wait() == -signal.SIGKILL
+        log.put(StepBatch(steps=steps[60:90]))  # while nobody records
+        with running(run_dir) as process:
+            wait_for_rows(bus)
+            log.put(StepBatch(steps=steps[90:], last=True))
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=PATIENCE_S) == 0
+    assert reading.columns(run_dir.recording_path, "/env/reward")[0].tolist() == list(range(120))
+    assert [stats.counters["dropped"] for stats in run_dir.read_final_stats()] == [0, 0]
+
+
 @contextmanager
 def running(run_dir: RunDir) -> Iterator[subprocess.Popen[bytes]]:
     with subprocess.Popen([sys.executable, "-m", "recorder", "--run", str(run_dir.path)]) as process:

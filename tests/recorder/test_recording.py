@@ -190,7 +190,12 @@ def test_the_file_is_compact_verified_and_has_one_dashboard(told: Stage) -> None
 def test_the_books_are_right(told: Stage) -> None:
     ticks = 6 * 120 + 2 * 120 + (120 - 12) + 12 + 1  # six series, point and frame, versions, returns, a cause
     others = 2 + 4 + 3 + 4  # publications, phases, lines, gauges
-    assert told.ledger.stats(0).counters == {"rows": ticks + others, "dropped": 0, "live_dropped": 0}
+    assert told.ledger.stats(0).counters == {
+        "rows": ticks + others,
+        "dropped": 0,
+        "disk_dropped": 0,
+        "live_dropped": 0,
+    }
 
 
 def test_light_detail_leaves_3d_out(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -18,11 +16,9 @@ import pytest
 from rtcore.clock import VirtualClock
 from rtcore.lifecycle import (
     Continuations,
-    JsonLines,
     RateLimited,
     Stop,
     die_with_parent,
-    log_to_file,
     stop_on_signals,
 )
 
@@ -147,62 +143,6 @@ def test_a_parent_that_is_gone_already_counts_as_ended() -> None:
 def test_where_the_kernel_offers_no_such_thing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rtcore.libc._prctl", None)
     assert not die_with_parent()
-
-
-def lines(path: Path) -> list[dict[str, object]]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def test_the_log_is_json_lines_and_warnings_reach_stderr(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "logs" / "learner.jsonl"
-    before_ns = time.monotonic_ns()
-    with log_to_file(path, "learner"):
-        logging.getLogger("learner.replay").info("took %d steps", 3)
-        assert lines(path)[0]["text"] == "took 3 steps"  # written at once
-        logging.getLogger("learner").debug("nobody asked")
-        logging.getLogger("learner").warning("two\nlines")
-    first, second = lines(path)
-    assert list(first) == ["ts", "mono_ns", "level", "process", "logger", "text"]
-    assert (first["level"], first["process"], first["logger"]) == ("INFO", "learner", "learner.replay")
-    assert (second["level"], second["text"]) == ("WARN", "two\nlines")
-    assert datetime.fromisoformat(str(first["ts"])).utcoffset() == timedelta(0)
-    assert isinstance(first["mono_ns"], int)
-    assert before_ns <= first["mono_ns"] <= time.monotonic_ns()
-    captured = capsys.readouterr().err
-    assert "learner: WARNING: two" in captured
-    assert "steps" not in captured
-
-
-def test_text_that_no_encoding_takes_is_logged_all_the_same() -> None:
-    record = logging.LogRecord("x", logging.CRITICAL, "x.py", 1, "file \udcff of %s", ("a",), None)
-    line = json.loads(JsonLines("recorder").format(record).encode("ascii"))
-    assert (line["text"], line["level"], line["process"]) == ("file \udcff of a", "ERROR", "recorder")
-
-
-def test_the_log_tells_exceptions_and_is_appended_to(tmp_path: Path) -> None:
-    path = tmp_path / "env_server.jsonl"
-    for _ in range(2):
-        with log_to_file(path, "env_server"):
-            try:
-                raise KeyError("scale")
-            except KeyError:
-                logging.getLogger("env_server").exception("env_server failed")
-    assert [line["text"] for line in lines(path)] == ["env_server failed"] * 2
-    exception = str(lines(path)[0]["exception"])
-    assert exception.startswith("Traceback")
-    assert exception.endswith("KeyError: 'scale'")
-
-
-def test_closing_the_log_leaves_logging_as_it_was(tmp_path: Path) -> None:
-    root = logging.getLogger()
-    before = (root.level, list(root.handlers))
-    handle = log_to_file(tmp_path / "x.jsonl", "x", level=logging.DEBUG)
-    assert root.level == logging.DEBUG
-    handle.close()
-    handle.close()
-    assert (root.level, root.handlers) == before
 
 
 def test_a_continuation_is_stamped_once_and_told_once() -> None:
