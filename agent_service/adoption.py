@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,12 +19,31 @@ from rtcore.signing import NoVerifier, Verifier
 from rtcore.spaces import Spaces
 from rtcore.weights import WeightsError, verify
 
+NEWEST = "policies.newest"  # a counter: the newest version that this life took
+COMPLAINT_NS = 1_000_000_000  # at most one line in so long about refused policies
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """What earlier lives of the run's processes leave to this one, and it to later ones.
+
+    Attributes:
+        newest: the newest policy that this host knows of.
+        floor: the newest version that an earlier life of the agent took; older ones are refused.
+        keep: is given each good new policy, before it may act; None: nobody keeps it.
+    """
+
+    newest: Policy | None = None
+    floor: int = 0
+    keep: Callable[[Policy], None] | None = None
+
 
 class Adoption:
     """Candidates for the swap. One thread offers, one takes.
 
     Counts `policies.received`, `.rejected` and `.superseded` (replaced by a newer one before it acted);
-    a repeat of the newest version, which a late or reconnected reader gets, counts as `.repeated` alone.
+    a repeat of the newest version, which a late or reconnected reader gets, counts as `.repeated` alone. One
+    that is older than the newest is rejected and counts as `.past` besides: it was there before.
     """
 
     def __init__(
@@ -31,37 +51,64 @@ class Adoption:
         spec: Spec,
         ledger: Ledger,
         verifier: Verifier | None = None,
-        keep: Callable[[Policy], None] | None = None,
+        past: Past | None = None,
     ) -> None:
-        """`verifier` checks who signed a policy, None: nobody does; `keep` is given each good new one."""
-        self._keep = keep
+        """`verifier` checks who signed a policy, None: nobody does."""
+        self._past = past or Past()
         self._verifier = verifier or NoVerifier()
         self._spaces = Spaces.of(spec)
         self._ledger = ledger
         self._low: Array = np.asarray(spec.action_low, np.float32)
         self._high: Array = np.asarray(spec.action_high, np.float32)
         self._newest_version = 0
+        self._complaint_due_ns = 0
         # One place; pop and append are atomic, so the two threads need no lock.
         self._ready: deque[tuple[ActingPolicy, Policy]] = deque()
+
+    @property
+    def newest_version(self) -> int:
+        """Of the policies that were good; 0: there was none."""
+        return self._newest_version
 
     def offer(self, policy: Policy, now_ns: int) -> None:
         """Check a policy and make it ready; a bad one is refused, counted and reported."""
         if policy.version == self._newest_version:
             self._ledger.count("policies.repeated")
             return
-        self._ledger.count("policies.received")
+        known = max(self._newest_version, self._past.floor)
+        if policy.version < known:
+            self._ledger.count_together("policies.received", "policies.rejected", "policies.past")
+            self._complain(now_ns, f"policy {policy.version} refused: version {known} was there before")
+            return
         try:
             ready = self._prepare(policy)
         except WeightsError as error:
-            self._ledger.count("policies.rejected")
-            self._ledger.event(now_ns, "WARN", f"policy {policy.version} refused: {error}")
+            self._ledger.count_together("policies.received", "policies.rejected")
+            self._complain(now_ns, f"policy {policy.version} refused: {error}")
             return
+        # Nothing acts that a later life would not know of.
+        if self._past.keep is not None:
+            self._past.keep(policy)
         self._newest_version = policy.version
+        self._note(policy.version)
+        self._ledger.count("policies.received")
         if self.take() is not None:
             self._ledger.count("policies.superseded")
         self._ready.append((ready, policy))
-        if self._keep is not None:
-            self._keep(policy)
+
+    def _note(self, version: int) -> None:
+        """What of this life a summary over several needs: a later one gets the newest again. Before it counts
+        as received: a kill in between makes it received in the next life, and never twice in none.
+        """
+        if not self._ledger.counter("policies.first"):
+            self._ledger.set_counter("policies.first", version)
+        self._ledger.set_counter(NEWEST, version)
+
+    def _complain(self, now_ns: int, text: str) -> None:
+        """Report a refusal, if none was in the last second; all are counted."""
+        if now_ns >= self._complaint_due_ns:
+            self._complaint_due_ns = now_ns + COMPLAINT_NS
+            self._ledger.event(now_ns, "WARN", text)
 
     def take(self) -> tuple[ActingPolicy, Policy] | None:
         """The policy that is ready for the swap, once."""
@@ -71,8 +118,6 @@ class Adoption:
             return None
 
     def _prepare(self, policy: Policy) -> ActingPolicy:
-        if policy.version < self._newest_version:
-            raise WeightsError(f"version {self._newest_version} was there before")
         self._verifier.check(policy)
         arrays = verify(policy, self._spaces)
         if self._spaces.finite:

@@ -1,12 +1,15 @@
 """The newest policy that this host knows of, for an agent that starts again, maybe beside no learner.
 
-It is also the floor: what is older is refused, so nobody can bring an old policy back by replaying it.
+Older ones than this, or than the newest that an earlier life of the agent took, are refused: so nobody can
+bring an old policy back by replaying it.
 """
 
 from __future__ import annotations
 
 import msgspec
 
+from agent_service.adoption import NEWEST, Past
+from rtcore import channels, tally
 from rtcore.clock import Clock
 from rtcore.files import write_atomic
 from rtcore.ledger import Ledger
@@ -24,6 +27,23 @@ class Kept:
         self._ledger = ledger
         self._clock = clock
         self._verifier = verifier
+
+    def past(self) -> Past:
+        """What an agent that begins now goes on from."""
+        return Past(self.newest(), self.floor(), self.keep)
+
+    def floor(self) -> int:
+        """The newest version that an earlier life of the agent took; 0: none did."""
+        tallies = self._run_dir.logs_dir.glob(f"{channels.AGENT}-*.tally")
+        for path in sorted(tallies, key=lambda path: (len(path.name), path.name), reverse=True):
+            try:
+                version = tally.read(path).get(NEWEST, 0)
+            except OSError as error:
+                self._say(f"{path.name} cannot be read: {error}")
+                continue
+            if version:  # no life takes an older one than the life before
+                return version
+        return 0
 
     def newest(self) -> Policy | None:
         """The newest one whose signature is right; another is refused, counted and reported."""

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-import struct
 import threading
-from collections.abc import Callable
 
 import numpy as np
 
-from agent_service.adoption import Adoption
+from agent_service.adoption import Adoption, Past
 from agent_service.evidence import Evidence
-from agent_service.freshness import Freshness
+from agent_service.gate import Gate
 from agent_service.inference import ActingPolicy, UniformPolicy
 from agent_service.tables import UniformChoice
 from rtcore import channels
+from rtcore.admission import check_same_world
 from rtcore.bus import Bus, Received
 from rtcore.clock import Clock
 from rtcore.config import RunConfig
+from rtcore.epoch import this_boot
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
-from rtcore.messages import Action, Command, CommandReply, Policy, Spec, Step
+from rtcore.messages import Action, Command, CommandReply, Spec, Step
 from rtcore.signing import Verifier
 
 WAIT_S = 0.2  # how long a wait may last before `stop`, or a failure, is looked at
+SPEC_POLL_S = 0.005
+MAX_DECLARED = 256  # incarnations of the env server remembered, the newest
+# An agent that starts again waits so long for a policy as new as its last one, before it acts on what it has.
+# From a file one is there within milliseconds; the learner's link comes back after 250 ms at worst.
+PREPARE_S = 0.3
 HANGS_NS = 1_000_000_000  # an answer takes under a millisecond
 AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's
 
@@ -41,24 +46,24 @@ class AgentService:
         bus: Bus,
         clock: Clock,
         ledger: Ledger,
-        last_published: Policy | None = None,
+        past: Past | None = None,
         evidence: Evidence | None = None,
         verifier: Verifier | None = None,
-        keep: Callable[[Policy], None] | None = None,
     ) -> None:
-        """`last_published` is the run's newest policy so far, for an agent that starts beside no learner;
-        `verifier` checks who signed a policy, None: nobody does; `keep` is given each good new policy.
+        """`past` is what earlier lives leave to this one; `verifier` checks who signed a policy, None: nobody
+        does.
         """
-        self._keep = keep
+        self._past = past or Past()
+        self._last_published = self._past.newest
+        self._prepared = threading.Event()
         name = config.env.name
         self._name = name
         self._bus = bus
         self._clock = clock
-        self._last_published = last_published
         self._verifier = verifier
         self._ledger = ledger
         self._rng = np.random.default_rng([config.seed, AGENT_STREAM])
-        self._specs = bus.latest(channels.SPEC, name)
+        self._specs = bus.queue(channels.SPEC, name, capacity=MAX_DECLARED)
         self._policies = bus.queue(channels.POLICY, capacity=64)
         self._actions = bus.publisher(channels.ACTION, name)
         self._acting = threading.Lock()  # two links may deliver at once while one replaces the other
@@ -68,14 +73,17 @@ class AgentService:
         self._hang_told = False
         self._evidence = evidence or Evidence(clock.now_ns)
         self._spec: Spec | None = None
-        self._freshness = Freshness(0)
+        self._boot = ""
+        self._gates: dict[int, Gate] = {}  # by incarnation
         self._policy: ActingPolicy | None = None
         self._adoption: Adoption | None = None
         self._reaction = ledger.histogram("reaction")
         self._publish_to_adopt = ledger.histogram("publish_to_adopt")
 
     def run(self, stop: Stop) -> None:
-        """Act until stopped. What acting failed with is raised here."""
+        """Get ready, with `check_policies` beside it; then act until stopped. What acting failed with is
+        raised here."""
+        self._prepared.wait(PREPARE_S)
         self.attend()
         while not stop.wait(WAIT_S):
             self.check()
@@ -105,16 +113,19 @@ class AgentService:
     def check_policies(self, stop: Stop) -> None:
         """Check policies as they arrive, until stopped; for a thread beside `run`."""
         while not stop.is_set():
-            if self._adoption is None:
-                stop.wait(0.01)
-                continue
             self.poll_policies()
+            if self._adoption is None:
+                stop.wait(SPEC_POLL_S)
+                continue
+            if self._adoption.newest_version >= self._past.floor:
+                self._prepared.set()
             self._policies.wait(WAIT_S)
 
     def poll_policies(self) -> None:
         """Check the policies that have arrived. Does nothing before the environment is known."""
-        if self._adoption is None:
+        if not self._is_declared():
             return
+        assert self._adoption is not None
         last_published, self._last_published = self._last_published, None
         policies = [received.message for received in self._policies.drain()]
         for policy in policies if last_published is None else [last_published, *policies]:
@@ -128,18 +139,14 @@ class AgentService:
         if not self._knows(step):
             self._ledger.count("observations.unknown")
             return
-        assert self._spec is not None
-        fits = _fits(step.observation, self._spec)
-        if step.rehearsal and fits:
+        fault = self._gates[step.incarnation].judge(step, received.received_ns)
+        if step.rehearsal and not fault:
             self._respond(received)
             self._ledger.count("rehearsals")
             return
         self._ledger.count("observations")
-        if self._freshness.is_old(step.sent_ns, received.received_ns):
-            self._ledger.count("observations.superseded")
-            return
-        if not fits:
-            self._ledger.count("observations.invalid")
+        if fault:
+            self._ledger.count(f"observations.{fault}")
             return
         self._respond(received)
         self._reaction.record(self._clock.now_ns() - received.received_ns)
@@ -218,29 +225,35 @@ class AgentService:
         )  # fmt: skip
         self._evidence.swapping.stop()
 
+    def _is_declared(self) -> bool:
+        """Whether an environment has declared itself; for a thread that does not act, so that policies are
+        ready before the first observation comes."""
+        if self._adoption is None:
+            with self._acting:
+                self._take_declaration()
+        return self._adoption is not None
+
     def _knows(self, step: Step) -> bool:
         """Whether the environment behind `step` has declared itself; takes its declaration if new."""
-        if self._spec is not None and self._spec.incarnation == step.incarnation:
-            return True
-        declared = self._specs.take()
-        if declared is not None:
+        if step.incarnation not in self._gates:
+            self._take_declaration()
+        return step.incarnation in self._gates
+
+    def _take_declaration(self) -> None:
+        for declared in self._specs.drain():
             self._meet(declared.message)
-        return self._spec is not None and self._spec.incarnation == step.incarnation
 
     def _meet(self, spec: Spec) -> None:
-        if self._spec is None:  # a later one is the same world in a new incarnation
+        if self._spec is None:
             low, high = np.asarray(spec.action_low, np.float32), np.asarray(spec.action_high, np.float32)
             self._policy = UniformChoice(spec.actions) if spec.states else UniformPolicy(low, high)
-            self._adoption = Adoption(spec, self._ledger, self._verifier, self._keep)
-        self._freshness = Freshness(spec.tick_ns)
-        self._spec = spec
-
-
-def _fits(observation: bytes, spec: Spec) -> bool:
-    """Whether it is one of this world's: as long as declared, and in a finite one a state's number."""
-    if len(observation) != 4 * spec.observation_dim:
-        return False
-    if not spec.states:
-        return True
-    state: float = struct.unpack_from("<f", observation)[0]
-    return 0 <= state < spec.states and state.is_integer()
+            self._adoption = Adoption(spec, self._ledger, self._verifier, self._past)
+            self._spec, self._boot = spec, this_boot()
+        try:
+            check_same_world(spec, self._spec)  # a later one is the same world in a new incarnation
+        except ValueError as error:
+            self._bus.reject(channels.SPEC, error)
+            return
+        self._gates[spec.incarnation] = Gate(spec, self._boot)
+        if len(self._gates) > MAX_DECLARED:
+            del self._gates[min(self._gates)]

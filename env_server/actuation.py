@@ -142,6 +142,10 @@ class Actuation:
             clipped=clipped,
         )
 
+    def answers(self, message: Action, expected_tick: int) -> bool:
+        """Whether the message would decide."""
+        return self._judge(message, expected_tick)[0] == "answer"
+
     def observed(self, observation: Vector) -> Vector:
         """`observation` followed by the last `observe_actions` decisions, newest first; neutral ones before
         the episode's first.

@@ -106,6 +106,10 @@ class Rollout:
             broken=broken,
         )
 
+    def answers(self, message: Action, expected_tick: int) -> bool:
+        """Whether the message would decide in a turn that is no reset."""
+        return self._actuation.answers(message, expected_tick)
+
     def _reset(self, newest: Action | None, t: int) -> Turn:
         """Begin an episode whose start follows from the run's seed and the episode's index alone."""
         self._episode += 1

@@ -175,13 +175,14 @@ class EnvService:
     def act(self, tick: Tick) -> Entry:
         """What a deadline cannot wait with: take the newest action, turn the world, publish."""
         heard = self._listen()
-        newest = heard[-1] if heard else None  # the older ones only tell why they come late
         asked = self._observed[-1] if self._observed else None
+        expected_tick = -1 if asked is None else asked.tick
+        if len(heard) > 1:  # an answer is not lost to what comes after it and is none
+            heard.sort(key=lambda received: self._rollout.answers(received.message, expected_tick))
+        newest = heard[-1] if heard else None  # the older ones only tell why they come late
         unit = (tick.due_ns - self._t0_ns) // self._unit_ns
         turn = self._rollout.turn(
-            None if newest is None else newest.message,
-            unit,
-            expected_tick=-1 if asked is None else asked.tick,
+            None if newest is None else newest.message, unit, expected_tick=expected_tick
         )
         latency = Latency() if newest is None else self._latency(newest)
         position = self._world.position()

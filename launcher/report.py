@@ -128,7 +128,7 @@ def _learning(summary: Summary) -> RenderableType:
         ),
         (
             "policies",
-            f"{policies['published']} published, {policies['adopted']} adopted, "
+            f"{policies['published']} published, {policies['adopted']} adopted{_again(policies)}, "
             f"{policies['published_in_hold']} in a hold; adopted after "
             f"{drawing.number(adopt['p50'], 1)} ms (p99 {drawing.number(adopt['p99'], 1)})",
         ),
@@ -140,7 +140,24 @@ def _learning(summary: Summary) -> RenderableType:
             drawing.number(forecast["baseline_error"], 3),
         )
         rows.append(("forecast", f"{forecast['windows']} judged, error {error} against {baseline} without"))
+    if summary.get("regret") is not None:
+        rows.append(("regret", _regret(summary["regret"])))
     return drawing.pairs(rows)
+
+
+def _again(policies: Summary) -> str:
+    """What adds to the adopted, after restarts of the agent."""
+    return f" ({policies['received_again']} received again)" if policies["received_again"] else ""
+
+
+def _regret(regret: Summary) -> str:
+    """Exact, a unit's mean in all and in each phase."""
+    phases = [
+        f"{phase} {drawing.number(regret[phase] / units, 3)}"
+        for phase in ("update", "hold")
+        if (units := regret[f"{phase}_units"])
+    ]
+    return f"{drawing.number(regret['per_unit'], 3)} per unit ({', '.join(phases)})"
 
 
 def _accounts(summary: Summary) -> RenderableType:

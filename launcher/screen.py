@@ -19,7 +19,7 @@ from rich.text import Text
 
 from launcher import drawing
 from launcher.drawing import ACCENT, LABEL
-from launcher.summary import Totals
+from launcher.summary import PASSED, Totals
 from launcher.watch import RETURNS_SHOWN, Watch
 from rtcore import channels
 from rtcore.clock import Clock
@@ -31,7 +31,14 @@ LINE_NS = 5_000_000_000
 LOG_LINES = 5
 WIDTH = 100  # wider gains nothing to read
 
-STATE_STYLE = {"alive": "green", "late": "yellow", "missing": "red", "starting": LABEL, "ended": LABEL}
+STATE_STYLE = {
+    "alive": "green",
+    "late": "yellow",
+    "missing": "red",
+    "down": "red",
+    "starting": LABEL,
+    "ended": LABEL,
+}
 LEVEL_STYLE = {"WARN": "yellow", "ERROR": "red"}
 # What a process is asked to do, as a rate: the counter and its unit.
 WORK = {
@@ -113,6 +120,8 @@ class Screen:
             f"return {drawing.number(now.env.returns[-1], 1) if now.env.returns else '·'}",
         ]
         troubled = [f"{name} {state}" for name in self._processes if (state := self._state(name)) != "alive"]
+        if restarts := self._watch.restarts.total():
+            troubled.append(f"restarts {restarts}")
         return "  ".join(parts + troubled + ([self.note] if self.note else []))
 
     def render(self) -> RenderableType:
@@ -135,19 +144,21 @@ class Screen:
 
     def _read(self) -> Now:
         env = self._watch.totals(channels.ENV_SERVER)
-        ticked = env.counters["ticks"] + env.counters["skipped"]
+        passed = sum(env.counters[name] for name in PASSED)
         return Now(
-            ticked / (self._config.env.hz or 1.0),
+            passed / (self._config.env.hz or 1.0),
             env,
             self._watch.totals(channels.AGENT),
             self._watch.totals(channels.LEARNER),
         )
 
     def _state(self, process: str) -> str:
-        if self._watch.ended(process):
-            return "ended"
+        if process in self._watch.down:
+            return "down"
         if not self._watch.heard(process):
             return "starting"
+        if self._watch.ended(process):
+            return "ended"
         return self._watch.health(process, self._clock.now_ns())
 
     def _progress(self, now: Now) -> RenderableType:
@@ -179,12 +190,15 @@ class Screen:
         table.add_column(style=LABEL, no_wrap=True)
         table.add_column(no_wrap=True)
         table.add_column(justify="right", no_wrap=True)
+        table.add_column(style="yellow", no_wrap=True)
         for process in self._processes:
             counter, unit = WORK[process]
             state = self._state(process)
             rate = self._watch.rate(process, counter)
             shown = drawing.number(rate, 0 if rate is not None and rate >= 1000 else 1)
-            table.add_row(process, Text(f"● {state}", style=STATE_STYLE[state]), f"{shown} {unit}")
+            restarts = self._watch.restarts[process]
+            again = f"↻ {restarts}" if restarts else ""
+            table.add_row(process, Text(f"● {state}", style=STATE_STYLE[state]), f"{shown} {unit}", again)
         return table
 
     def _deadlines(self, now: Now) -> RenderableType:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any, Literal
@@ -15,6 +15,8 @@ from rtcore.messages import CAUSES, Stats, WindowNotice
 
 SCHEMA = 1
 FATES = ("adopted", "rejected", "superseded", "unused", "unreceived")  # of a published policy
+REJECTED = "messages.rejected."  # begins the counters of each channel
+PASSED = ("ticks", "skipped", "down")  # every deadline from T0 on is one of them
 
 Summary = dict[str, Any]
 StatsByProcess = Mapping[str, Sequence[Stats]]  # per process: the newest ledger of each incarnation
@@ -89,7 +91,7 @@ def summarise(
         "pacing_error_us": env.quantiles("pacing", 1e-3),
         "reaction_us": totals[AGENT].quantiles("reaction", 1e-3),
         "loop_us": env.quantiles("loop", 1e-3),
-        "policies": _policies(learner, totals[AGENT]),
+        "policies": _policies(learner, totals[AGENT], stats),
         "windows": _windows(learner.windows),
         "operator_holds": learner.counters["operator_holds"],
         "transitions": _transitions(env, learner),
@@ -97,8 +99,25 @@ def summarise(
         "forecast": _forecast(learner.gauges),
         "recorder": {"rows": recorder.counters["rows"], "dropped": recorder.counters["dropped"]},
         "restarts": {process: restarts.get(process, 0) for process in PROCESSES},
-        "messages": {"rejected": sum(total.counters["messages.rejected"] for total in totals.values())},
+        "supervision": [],
+        "messages": _messages(totals.values()),
     }
+
+
+def _messages(totals: Collection[Totals]) -> Summary:
+    """What came and was not taken: `rejected` for what it was, also by channel, `denied` for whom it was
+    from, by access control; and the links that secured processes refused.
+    """
+    counted = {"rejected": "messages.rejected", "denied": "link.denied", "links_refused": "link.refused"}
+    found: Summary = {
+        name: sum(total.counters[counter] for total in totals) for name, counter in counted.items()
+    }
+    by_channel: Counter[str] = Counter()
+    for total in totals:
+        for name, count in total.counters.items():
+            if name.startswith(REJECTED):
+                by_channel[name.removeprefix(REJECTED)] += count
+    return found | {"by_channel": dict(sorted(by_channel.items()))}
 
 
 def _about(config: RunConfig, run: str) -> Summary:
@@ -121,7 +140,11 @@ def discrepancies(summary: Summary) -> list[str]:
     pairs = [
         ("ticks = produced + resets", summary["ticks"], transitions["produced"] + summary["resets"]),
         ("produced = learned + lost", transitions["produced"], transitions["learned"] + transitions["lost"]),
-        ("published = " + " + ".join(FATES), policies["published"], fates),
+        (
+            "published + received_again = " + " + ".join(FATES),
+            policies["published"] + policies["received_again"],
+            fates,
+        ),
         (
             "missed = sum of its causes",
             summary["deadlines"]["missed"],
@@ -142,28 +165,58 @@ def _deadlines(env: Totals) -> Summary:
         "miss_ratio": missed / ticks if ticks else None,
         "overruns": env.counters["overruns"],
         "skipped": env.counters["skipped"],
+        "down": env.counters["down"],
         "missed_by_cause": dict.fromkeys(CAUSES, 0) | found,
     }
 
 
-def _policies(learner: Totals, agent: Totals) -> Summary:
-    """Every published policy has one of the `FATES`. `unused`: ready when the agent ended; `unreceived`:
-    no agent lived to get it. The last one of a run often has one of these two.
+def _policies(learner: Totals, agent: Totals, stats: StatsByProcess) -> Summary:
+    """Every published policy has one of the `FATES`. `unused`: ready when the agent ended, or died;
+    `unreceived`: no agent lived to get it. The last one of a run often has one of these two.
+
+    What the agent got once more has a fate once more, `received_again` of them: the newest one after it was
+    started again, and older ones, which it rejects.
     """
     published, received = learner.counters["published"], agent.counters["policies.received"]
+    again = _received_again(stats.get(AGENT, ()))
     latency = agent.quantiles("publish_to_adopt", 1e-6)
     return {
         "published": published,
         "adopted": agent.counters["policies.adopted"],
         "rejected": agent.counters["policies.rejected"],
         "superseded": agent.counters["policies.superseded"],
-        "unused": agent.counters["policies.unused"],
-        "unreceived": published - received,
+        "unused": agent.counters["policies.unused"] + _died_with_a_policy(stats.get(AGENT, ())),
+        "unreceived": published - (received - again),
+        "received_again": again,
         "published_in_hold": learner.counters["published_in_hold"],
         "withheld": learner.counters["withheld"],
-        "last_version": learner.counters["last_version"],
+        "last_version": max(
+            (life.counters.get("last_version", 0) for life in stats.get(LEARNER, ())), default=0
+        ),
         "publish_to_adopt_ms": {name: latency[name] for name in ("p50", "p99", "max")},
     }
+
+
+def _died_with_a_policy(lives: Iterable[Stats]) -> int:
+    """Policies received by a life of the agent that was killed before it could say what became of them."""
+    killed = [Counter(life.counters) for life in lives if not life.final]
+    known = ("adopted", "rejected", "superseded", "unused")
+    return sum(
+        max(0, counters["policies.received"] - sum(counters[f"policies.{fate}"] for fate in known))
+        for counters in killed
+    )
+
+
+def _received_again(lives: Iterable[Stats]) -> int:
+    """Policies that were there before: older than the newest, or what a life of the agent began with and an
+    earlier one had.
+    """
+    newest = again = 0
+    for life in sorted(lives, key=lambda one: one.incarnation):
+        first = life.counters.get("policies.first", 0)
+        again += (0 < first <= newest) + life.counters.get("policies.past", 0)
+        newest = max(newest, life.counters.get("policies.newest", 0))
+    return again
 
 
 def _windows(notices: Iterable[WindowNotice]) -> list[Summary]:
@@ -206,8 +259,8 @@ def _governor(learner: Totals) -> Summary:
 
 
 def _run_time_s(env: Totals, config: RunConfig) -> float:
-    """Seconds of run time that were ticked through or skipped."""
-    return (env.counters["ticks"] + env.counters["skipped"]) / config.env.hz if config.env.hz else 0.0
+    """Seconds of run time that were ticked through, skipped, or without an env server."""
+    return sum(env.counters[name] for name in PASSED) / config.env.hz if config.env.hz else 0.0
 
 
 def _forecast(gauges: Mapping[str, float]) -> Summary:

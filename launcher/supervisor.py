@@ -1,12 +1,9 @@
-"""The processes of a run on this machine: started together, watched, and ended in order."""
+"""The processes of a run on this machine: started together, started again, and ended in order."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +12,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
+from launcher.children import Children
+from launcher.restarts import Again, GiveUp, Happening, Restarts, What, describe
+from launcher.starting import process_command
+from launcher.vitals import Vitals
 from rtcore import channels
 
 Reason = Literal["duration", "interrupted", "failed", "killed"]
@@ -22,7 +23,7 @@ Reason = Literal["duration", "interrupted", "failed", "killed"]
 POLL_S = 0.05
 INTERRUPTED_LIMIT_S = 4.5  # from Ctrl-C to the last kill; the summary fits into what is left of 5 s
 ENDING_LIMIT_S = 20.0  # when nobody is waiting: the recorder may take 10 s to compact a long recording
-TAIL_LINES = 12
+NOT_STARTED = 126  # exit code of a life that the system refused, as shells have it
 
 # The world ends first, then who depends on what it sent. A process gets its SIGTERM when all before
 # it have ended, or when this share of the time is over.
@@ -31,20 +32,20 @@ LATEST_SHARE = {channels.ENV_SERVER: 0.0, channels.AGENT: 0.2, channels.LEARNER:
 
 def command_for(process: str, run_dir: Path) -> list[str]:
     """The command line of one process under a supervisor."""
-    return [sys.executable, "-m", process, "--run", str(run_dir), "--supervised", str(os.getpid())]
+    return process_command(process, run_dir, supervisor=os.getpid())
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A process that ended when it should not have."""
+    """A process that ended when it should not have, for the last time."""
 
     process: str
     code: int  # negative: the signal that ended it
     output: str  # its last lines
+    why: str = ""  # it is not started again, if that was the question
 
     def __str__(self) -> str:
-        how = f"exit code {self.code}" if self.code >= 0 else f"signal {signal.Signals(-self.code).name}"
-        return f"{self.process} ended unexpectedly ({how})"
+        return f"{self.process} {self.why or f'ended unexpectedly ({describe(self.code)})'}"
 
 
 @dataclass
@@ -113,28 +114,49 @@ class OrderlyEnd:
 class Supervisor:
     """Child processes by name; the first of them is the one whose orderly end ends the run."""
 
-    def __init__(self, commands: Mapping[str, Sequence[str]], output_dir: Path) -> None:
-        self._commands = dict(commands)
-        self._output_dir = output_dir
-        self._children: dict[str, subprocess.Popen[bytes]] = {}
+    def __init__(
+        self,
+        commands: Mapping[str, Sequence[str]],
+        output_dir: Path,
+        *,
+        restarts: Restarts | None = None,
+        vitals: Vitals | None = None,
+        tell: Callable[[Happening], None] = lambda happening: None,  # noqa: ARG005 - nobody listens
+    ) -> None:
+        """Args:
+        commands: a command line per process.
+        output_dir: what they print is in `<process>.out` there.
+        restarts: decides on who died; None: any death ends the run.
+        vitals: says who is stuck, which whoever calls `supervise` keeps informed; None: nobody ever is.
+        tell: called with what happens.
+        """
+        self._children = Children(commands, output_dir)
+        self._restarts = restarts
+        self._vitals = vitals
+        self._tell = tell
+        self._dead: set[str] = set()  # whose death has been entered
+        self._due_ns: dict[str, int] = {}  # of the dead: when their next life begins
+        self._hung: set[str] = set()  # killed for that, and not seen to end yet
 
     @contextmanager
     def started(self) -> Iterator[None]:
         """Start all; whatever still runs when the block is left is killed."""
-        try:
-            for process in self._commands:
+        with self._children.kept():
+            for process in self._children.names:
                 self._start(process)
             yield
-        finally:
-            self._kill(self.running())
 
     def running(self) -> frozenset[str]:
         """Who runs."""
-        return frozenset(name for name, child in self._children.items() if child.poll() is None)
+        return self._children.running()
+
+    def ended_well(self, process: str) -> bool:
+        """Whether its last life ended with exit code 0."""
+        return self._children.exits().get(process) == 0
 
     def supervise(self, interrupts: Interrupts, on_poll: Callable[[frozenset[str]], None]) -> End:
-        """Wait for the run's end and carry it out: the first process ends by itself, another one
-        dies, or somebody interrupts (twice: kill at once).
+        """Start again who dies, until the run's end, and carry that out: the first process ends by itself,
+        one is given up, or somebody interrupts (twice: kill at once).
 
         Args:
             interrupts: counts them.
@@ -143,12 +165,12 @@ class Supervisor:
         """
         end = self._wait(interrupts, on_poll)
         limit_s = INTERRUPTED_LIMIT_S if end.reason == "interrupted" else ENDING_LIMIT_S
-        plan = OrderlyEnd(tuple(self._commands), time.monotonic(), limit_s)
+        plan = OrderlyEnd(self._children.names, time.monotonic(), limit_s)
         asked_before = interrupts.count
         hurried = end.reason == "interrupted"
         while running := self.running():
             if interrupts.count >= 2:
-                self._kill(running)
+                self._children.kill(running)
                 end.reason = "killed"
                 break
             if interrupts.count > asked_before and not hurried:
@@ -157,65 +179,92 @@ class Supervisor:
             self._send(plan.due(time.monotonic(), running), end)
             on_poll(running)
             time.sleep(POLL_S)
-        end.failures += self._failures(already={one.process for one in end.failures}, forced=end.forced)
+        self._judge_ending(end)
         return end
 
     def _wait(self, interrupts: Interrupts, on_poll: Callable[[frozenset[str]], None]) -> End:
         """Until there is a reason to end."""
-        leader = next(iter(self._commands))
+        leader = self._children.names[0]
         while not interrupts.count:
-            codes = {name: child.poll() for name, child in self._children.items()}
-            exits = {name: code for name, code in codes.items() if code is not None}
-            bad = [name for name, code in exits.items() if name != leader or code != 0]
-            if exits.get(leader) == 0:
-                return End("duration", [self._failure(name) for name in bad if exits[name] != 0])
-            if bad:
-                return End("failed", [self._failure(name) for name in bad])
+            exits = {name: n for name, n in self._children.exits().items() if name not in self._dead}
+            over = exits.get(leader) == 0
+            bad = {name: n for name, n in exits.items() if not (over and n == 0)}
+            failures = [failure for name, n in bad.items() if (failure := self._died(name, n))]
+            if over:
+                return End("duration", failures)
+            self._kill_stuck()
+            failures += self._start_due()
+            if failures:
+                return End("failed", failures)
             on_poll(frozenset())
             time.sleep(POLL_S)
         return End("interrupted")
 
+    def _died(self, process: str, code: int, error: OSError | None = None) -> Failure | None:
+        """Enter a death, or that a life could not begin; a failure if it is the last one."""
+        what: What = "stuck" if process in self._hung else "died"
+        how = f"died ({describe(code)})" if error is None else f"cannot be started ({error})"
+        how = "hung and was killed" if what == "stuck" else how
+        self._dead.add(process)
+        self._hung.discard(process)
+        if self._vitals is not None:
+            self._vitals.gone(process)
+        verdict: Again | GiveUp = GiveUp("")
+        if self._restarts is not None:
+            verdict = self._restarts.died(process, time.monotonic(), code, hung=what == "stuck")
+        if isinstance(verdict, Again):
+            self._due_ns[process] = time.monotonic_ns() + round(verdict.delay_s * 1e9)
+            self._happened(process, what, code, f"{how}; it is started again in {verdict.delay_s:.2g} s")
+            return None
+        self._happened(process, what, code, how)
+        failure = Failure(process, code, self._children.tail(process), verdict.why)
+        self._tell(Happening(time.monotonic_ns(), process, "gave_up", code, f"{failure}: the run ends"))
+        return failure
+
+    def _kill_stuck(self) -> None:
+        for process in [] if self._vitals is None else self._vitals.stuck(time.monotonic_ns()):
+            self._hung.add(process)
+            self._children.signal(process, signal.SIGKILL)
+
+    def _start_due(self) -> list[Failure]:
+        now_ns = time.monotonic_ns()
+        failures: list[Failure] = []
+        for process in [name for name, due_ns in self._due_ns.items() if now_ns >= due_ns]:
+            del self._due_ns[process]
+            try:
+                self._start(process)
+            except OSError as error:  # no memory, no file descriptors: that may pass
+                failure = self._died(process, NOT_STARTED, error)
+                failures += [failure] if failure else []
+            else:
+                self._happened(process, "restarted", None, "is started again")
+        return failures
+
     def _start(self, process: str) -> None:
-        # One file for both streams keeps their order. A process group of its own keeps the terminal's
-        # Ctrl-C from it; a session of its own would make it an autogroup of its own, against whose CPU
-        # share no niceness helps.
-        with (self._output_dir / f"{process}.out").open("ab") as output:
-            self._children[process] = subprocess.Popen(
-                self._commands[process],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                process_group=0,
-            )
+        self._children.start(process)
+        self._dead.discard(process)
+        if self._vitals is not None:
+            self._vitals.started(process)
+
+    def _happened(self, process: str, what: What, code: int | None, text: str) -> None:
+        self._tell(Happening(time.monotonic_ns(), process, what, code, f"{process} {text}"))
 
     def _send(self, due: Sequence[tuple[str, signal.Signals]], end: End) -> None:
         for process, number in due:
             if number is signal.SIGKILL:
                 end.forced.append(process)
-                self._kill(frozenset({process}))
+                self._children.kill({process})
             else:
-                self._children[process].send_signal(number)
+                self._children.signal(process, number)
 
-    def _kill(self, processes: frozenset[str]) -> None:
-        for process in processes:
-            with contextlib.suppress(ProcessLookupError):
-                self._children[process].kill()
-        for process in processes:
-            self._children[process].wait()
-
-    def _failures(self, already: set[str], forced: Sequence[str]) -> list[Failure]:
+    def _judge_ending(self, end: End) -> None:
         """Who ended badly while being ended. Not who died of our signals: of SIGTERM, when it had only
-        just been started and had no handler yet.
+        just been started and had no handler yet. Who was killed by somebody else is told, no more.
         """
-        codes = {name: child.returncode for name, child in self._children.items()}
-        excused = (0, -signal.SIGKILL, -signal.SIGTERM)
-        return [
-            self._failure(name)
-            for name, code in codes.items()
-            if code not in excused and name not in already and name not in forced
-        ]
-
-    def _failure(self, process: str) -> Failure:
-        text = (self._output_dir / f"{process}.out").read_text(errors="replace")
-        tail = [line for line in text.splitlines() if line.strip()][-TAIL_LINES:]
-        return Failure(process, self._children[process].returncode, "\n".join(tail))
+        for process, code in self._children.exits().items():
+            if process in self._dead or process in end.forced or code in (0, -signal.SIGTERM):
+                continue
+            if code != -signal.SIGKILL:
+                end.failures.append(Failure(process, code, self._children.tail(process)))
+            if end.reason != "killed":
+                self._happened(process, "died", code, f"died while it was to end ({describe(code)})")

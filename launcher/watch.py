@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import msgspec
 
+from launcher.restarts import Happening
 from launcher.summary import StatsByProcess, Totals, add_up
 from rtcore import channels
 from rtcore.health import Health, health
 from rtcore.messages import EpisodeReturn, Event, Stats, WindowNotice
+from rtcore.tally import raised
 
 RATE_SPAN_NS = 2_000_000_000  # long enough that four messages a second make a steady figure
 EVENTS_KEPT = 200
+MAX_LIVES = 1000  # of all processes: more are a stranger's; and so many histograms can be added up
 RETURNS_SHOWN = 60
 
 
@@ -35,19 +38,34 @@ class _Incarnation:
 
 
 class Watch:
-    """Folds Stats messages, in whatever order they come."""
+    """Folds Stats messages, in whatever order they come, and keeps what the launcher did itself.
+
+    Attributes:
+        events: what the processes said, newest last.
+        happenings: all deaths and restarts.
+        restarts: how often each process was started again.
+        down: processes between two lives, or given up.
+        refused: messages of lives beyond what there can be.
+    """
 
     def __init__(self, hz: float) -> None:
         self._hz = hz
+        self.refused = 0
         self._lives: dict[tuple[str, int], _Incarnation] = {}
         self._seen_ns: dict[str, int] = {}
         self._told_ns: dict[str, int] = {}  # stamp of each process's newest event
         self._recent: dict[str, deque[Stats]] = {}
         self.events: deque[tuple[str, Event]] = deque(maxlen=EVENTS_KEPT)
+        self.happenings: list[Happening] = []
+        self.restarts: Counter[str] = Counter()
+        self.down: set[str] = set()
 
     def feed(self, stats: Stats, received_ns: int) -> None:
         """Take in one message, received at `received_ns` on this process's clock."""
         key = (stats.process, stats.incarnation)
+        if key not in self._lives and len(self._lives) >= MAX_LIVES:
+            self.refused += 1
+            return
         life = self._lives.setdefault(key, _Incarnation(stats))
         if stats.seq >= life.newest.seq:
             life.newest = stats
@@ -61,6 +79,18 @@ class Watch:
         while len(recent) > 2 and stats.at_ns - recent[1].at_ns >= RATE_SPAN_NS:
             recent.popleft()
 
+    def happened(self, happening: Happening) -> None:
+        """Take note of a death or a restart. Nothing that an earlier life said tells how the next one is."""
+        self.happenings.append(happening)
+        process = happening.process
+        self._seen_ns.pop(process, None)
+        self._recent.pop(process, None)
+        if happening.what == "restarted":
+            self.restarts[process] += 1
+            self.down.discard(process)
+        else:
+            self.down.add(process)
+
     def _news(self, stats: Stats) -> list[tuple[str, Event]]:
         told_ns = self._told_ns.get(stats.process, -1)
         fresh = [(stats.process, event) for event in stats.events if event.at_ns > told_ns]
@@ -69,8 +99,15 @@ class Watch:
         return fresh
 
     def feed_final(self, stats: Iterable[Stats]) -> None:
-        """Take in what the processes wrote at their ends: nothing is missing from it."""
+        """Take in what the processes left behind: nothing is missing from last words, nor from the counters
+        of a life that was killed; of its other figures there are those that were heard.
+        """
         for one in stats:
+            heard = self._lives.get((one.process, one.incarnation))
+            if heard is not None and not one.final:
+                counters = raised(heard.newest.counters, one.counters)
+                heard.newest = msgspec.structs.replace(heard.newest, counters=counters)
+                continue
             self._lives[(one.process, one.incarnation)] = _Incarnation(
                 one, {episode.episode: episode for episode in one.returns}
             )
@@ -98,7 +135,7 @@ class Watch:
         return (last.counters.get(counter, 0) - first.counters.get(counter, 0)) / span_s
 
     def heard(self, process: str) -> bool:
-        """Whether anything ever came from it."""
+        """Whether anything came from it in this life."""
         return process in self._seen_ns
 
     def health(self, process: str, now_ns: int) -> Health:
@@ -111,9 +148,10 @@ class Watch:
         return newest is not None and newest.final
 
     def phase(self) -> WindowNotice | None:
-        """The phase that the learner entered last."""
-        newest = self._newest(channels.LEARNER)
-        return newest.windows[-1] if newest is not None and newest.windows else None
+        """The phase that the learner entered last, in whichever life."""
+        lives = [life.newest for (name, _), life in self._lives.items() if name == channels.LEARNER]
+        told = [stats for stats in lives if stats.windows]
+        return max(told, key=lambda stats: stats.incarnation).windows[-1] if told else None
 
     def _newest(self, process: str) -> Stats | None:
         lives = [life.newest for (name, _), life in self._lives.items() if name == process]

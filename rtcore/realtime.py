@@ -207,17 +207,17 @@ def apply(planned: Plan) -> Placement:
     pinned = bool(cores) and attempt(PINNING, lambda: pin(cores))
     if nice is not None:
         attempt(NICENESS, lambda: _be_nice(nice))
-    if priority is not None:
-        if pinned:
-            attempt(FIFO, lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority)))
-        else:
-            missing.append(FIFO)
     locked = planned.lock_memory and attempt(MEMORY, lambda: libc.mlockall(LOCK_FLAGS))
     if planned.freeze_collector:  # no pause in a tick; free, though no gain could be measured at 1 kHz
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
         gc.freeze()
         gc.disable()
+    if priority is not None:  # last: locking and collecting take 15 ms, which would be a world's ticks
+        if pinned:
+            attempt(FIFO, lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority)))
+        else:
+            missing.append(FIFO)
     return Placement(
         planned.role,
         scheduler=_scheduler(),

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent_service.adoption import Adoption
+from agent_service.adoption import Adoption, Past
 from agent_service.inference import UniformPolicy
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
@@ -156,15 +156,14 @@ def test_a_restarted_environment_is_answered_once_it_declares_itself(rig: Rig) -
     assert answer is not None and answer.incarnation == 8
 
 
-def test_beside_no_learner_the_last_published_policy_acts() -> None:
-    rig = Rig(MemoryHub(), last_published=policy(9, mean_bias=0.5))
+def test_beside_no_learner_the_last_published_policy_acts_from_the_first_answer_on() -> None:
+    rig = Rig(MemoryHub(), past=Past(newest=policy(9, mean_bias=0.5)))
     rig.specs.put(SPEC)
-    assert rig.answer(step(0)) is not None  # the environment is known now, and the policy can be checked
-    answer = rig.answer(step(1))
+    answer = rig.answer(step(0))
     assert answer is not None and answer.policy_version == 9
     rig.policies.put(policy(9, mean_bias=0.5))  # a learner comes, with the same one
     rig.policies.put(policy(10))
-    answer = rig.answer(step(2))
+    answer = rig.answer(step(1))
     assert answer is not None and answer.policy_version == 10
     assert rig.ledger.counter("policies.repeated") == 1
 

@@ -1,9 +1,10 @@
 """Real processes that stand in for the four: what they do is told by their arguments.
 
-    python children.py NAME DIRECTORY [obedient | stubborn | ends CODE]
+    python children.py NAME DIRECTORY [obedient | stubborn | ends CODE [LIVES]]
 
-`ends` waits until all four are ready. Each writes DIRECTORY/NAME.ready once its handlers are in place,
-and a line into DIRECTORY/ended.
+`ends` waits until all four are ready; with LIVES, only so many of its lives end by themselves. Each writes
+its pid into DIRECTORY/NAME.ready once its handlers are in place, its cores and niceness into
+DIRECTORY/NAME.lives, a line per life, and a line into DIRECTORY/ended.
 """
 
 from __future__ import annotations
@@ -18,15 +19,18 @@ from types import FrameType
 LIFETIME_S = 30.0  # so that nothing outlives a broken test
 
 
-def main(name: str, directory: Path, behaviour: str, code: str = "0") -> None:
+def main(name: str, directory: Path, behaviour: str, code: str = "0", lives: str = "1000") -> None:
     def obey(number: int, frame: FrameType | None) -> None:
         finish(name, directory, 0)
 
     # The terminal's Ctrl-C must not reach a child: one that gets it would be found out by its exit code.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.signal(signal.SIGTERM, signal.SIG_IGN if behaviour == "stubborn" else obey)
+    with (directory / f"{name}.lives").open("a") as file:
+        file.write(f"{sorted(os.sched_getaffinity(0))} {os.nice(0)}\n")
+    life = len((directory / f"{name}.lives").read_text().splitlines())
     (directory / f"{name}.ready").write_text(str(os.getpid()))
-    if behaviour == "ends":
+    if behaviour == "ends" and life <= int(lives):
         wait_for_the_others(directory)
         sys.stderr.write(f"{name}: no more\n")
         finish(name, directory, int(code))

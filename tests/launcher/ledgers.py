@@ -25,6 +25,7 @@ def ledger(
     returns: Sequence[EpisodeReturn] = (),
     windows: Sequence[WindowNotice] = (),
     events: Sequence[Event] = (),
+    beat_ns: int = 0,
 ) -> Stats:
     return Stats(
         process=process,
@@ -38,6 +39,7 @@ def ledger(
         returns=list(returns),
         windows=list(windows),
         events=list(events),
+        beat_ns=beat_ns,
     )
 
 
@@ -81,6 +83,7 @@ def env_ledger(*, seq: int = 0, at_ns: int = 0, final: bool = False) -> Stats:
             "overruns": 1,
             "skipped": 50,
             "messages.rejected": 1,
+            "messages.rejected.action": 1,
         },
         histograms={"pacing": [1_000, 1_000, 1_000, 9_000], "loop": [500_000]},
         returns=[episode(0, -30.0), episode(1, -10.0)],
@@ -94,6 +97,8 @@ def agent_ledger() -> Stats:
         "policies.rejected": 1,
         "policies.superseded": 1,
         "messages.rejected": 2,
+        "messages.rejected.policy": 1,
+        "messages.rejected.action": 1,
     }
     return ledger(
         AGENT, counters=counters, histograms={"reaction": [80_000], "publish_to_adopt": [4_000_000]}

@@ -8,10 +8,11 @@ import pytest
 from rich.console import Console
 
 from launcher import report
+from launcher.restarts import Happening
 from launcher.screen import Screen
 from launcher.summary import summarise
 from launcher.watch import Watch
-from rtcore.channels import ENV_SERVER, LEARNER
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER
 from rtcore.clock import VirtualClock
 from rtcore.config import RecorderConfig, RunConfig
 from rtcore.messages import Event
@@ -92,6 +93,21 @@ def test_a_run_without_recorder_does_not_wait_for_one() -> None:
     )
     console.print(screen.render())
     assert "recorder" not in file.getvalue()
+
+
+def test_who_is_between_two_lives_and_how_often() -> None:
+    watch = watched()
+    for what in ("died", "restarted", "died", "restarted", "died"):
+        watch.happened(Happening(5, LEARNER, what, None, what))
+    watch.happened(Happening(6, AGENT, "stuck", -9, "hung"))
+    watch.happened(Happening(6, AGENT, "restarted", None, "again"))
+    screen, file, console = screen_of(watch)
+    console.print(screen.render())
+    shown = [line for line in file.getvalue().splitlines() if "●" in line]
+    rows = {name: line for line in shown for name in (LEARNER, AGENT) if name in line}
+    assert "● down" in rows[LEARNER] and "↻ 2" in rows[LEARNER]
+    assert "● starting" in rows[AGENT] and "↻ 1" in rows[AGENT]
+    assert screen.line().endswith("agent_service starting  learner down  restarts 3")
 
 
 def test_without_a_terminal_it_is_a_line_every_five_seconds() -> None:

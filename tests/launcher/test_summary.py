@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from launcher.summary import discrepancies, summarise
+from launcher.summary import FATES, discrepancies, summarise
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER
-from rtcore.messages import CAUSES
+from rtcore.messages import CAUSES, Stats
 from tests.launcher.ledgers import CONFIG, agent_ledger, env_ledger, episode, ledger, whole_run
 
 NOBODY = dict.fromkeys(CAUSES, 0)
@@ -46,6 +46,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
             "miss_ratio": 0.015,
             "overruns": 1,
             "skipped": 50,
+            "down": 0,
             "missed_by_cause": {**NOBODY, "agent_late": 2, "env_late": 1},
         },
         "reaction_us": dict.fromkeys(nothing, 80.0),
@@ -57,6 +58,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
             "superseded": 1,
             "unused": 0,
             "unreceived": 1,
+            "received_again": 0,
             "published_in_hold": 0,
             "withheld": 0,
             "last_version": 4,
@@ -73,8 +75,14 @@ def test_the_whole_summary_of_a_small_run() -> None:
         },
         "forecast": {"windows": None, "error": None, "baseline_error": None, "trust": None},
         "recorder": {"rows": 900, "dropped": 7},
+        "supervision": [],
         "restarts": {"env_server": 0, "agent_service": 0, "learner": 0, "recorder": 0},
-        "messages": {"rejected": 3},
+        "messages": {
+            "rejected": 3,
+            "denied": 0,
+            "links_refused": 0,
+            "by_channel": {"action": 2, "policy": 1},
+        },
     }
     assert discrepancies(summary) == []
 
@@ -152,6 +160,60 @@ def test_counts_that_do_not_reconcile_are_named() -> None:
     found = discrepancies(summary_of({**stats, ENV_SERVER: [env], AGENT: [agent]}))
     assert found == [
         "ticks = produced + resets: 201 != 200",
-        "published = adopted + rejected + superseded + unused + unreceived: 4 != 5",
+        "published + received_again = adopted + rejected + superseded + unused + unreceived: 4 != 5",
         "missed = sum of its causes: 4 != 3",
     ]
+
+
+def agent_life(incarnation: int, *, final: bool, first: int, newest: int, **fates: int) -> Stats:
+    counters = {f"policies.{name}": count for name, count in fates.items()}
+    counters |= {"policies.first": first, "policies.newest": newest}
+    return ledger(AGENT, incarnation=incarnation, final=final, counters=counters)
+
+
+def test_policies_reconcile_over_the_lives_of_an_agent() -> None:
+    """Ten were published. The first life got 1..4, of which 4 was ready when it was killed; the second got
+    4 again, and 5 and 6; nobody lived for 7; the third began with 8 and got 9, unused, and not 10, and
+    somebody sent it 3 once more."""
+    learner = ledger(LEARNER, counters={"published": 10, "last_version": 10})
+    lives = [
+        agent_life(1, final=False, first=1, newest=4, received=4, adopted=2, superseded=1),
+        agent_life(2, final=True, first=4, newest=6, received=3, adopted=3),
+        agent_life(3, final=True, first=8, newest=9, received=3, adopted=1, unused=1, rejected=1, past=1),
+    ]
+    summary = summary_of({AGENT: lives[::-1], LEARNER: [learner]})
+    found = {name: summary["policies"][name] for name in (*FATES, "received_again")}
+    assert found == {
+        "adopted": 6,
+        "rejected": 1,
+        "superseded": 1,
+        "unused": 2,
+        "unreceived": 2,
+        "received_again": 2,
+    }
+    assert discrepancies(summary) == []
+
+
+def test_an_agent_that_received_more_than_there_was_is_named() -> None:
+    learner = ledger(LEARNER, counters={"published": 1})
+    lives = [agent_life(n, final=True, first=n, newest=n, received=1, adopted=1) for n in (1, 2)]
+    assert discrepancies(summary_of({AGENT: lives, LEARNER: [learner]})) == [
+        "policies.unreceived >= 0: it is -1"
+    ]
+
+
+def test_the_last_version_is_not_added_up() -> None:
+    lives = [ledger(LEARNER, incarnation=n, counters={"last_version": 5 * n}) for n in (1, 2)]
+    assert summary_of({LEARNER: lives})["policies"]["last_version"] == 10
+
+
+def test_deadlines_without_an_env_server_are_apart() -> None:
+    stats = whole_run()
+    later = ledger(ENV_SERVER, incarnation=9, counters={"ticks": 100, "produced": 100, "down": 50})
+    summary = summary_of({**stats, ENV_SERVER: [*stats[ENV_SERVER], later]})
+    assert {name: summary["deadlines"][name] for name in ("missed", "skipped", "down")} == {
+        "missed": 3,
+        "skipped": 50,
+        "down": 50,
+    }
+    assert summary["learner"]["updates_per_s"] == 250 / 4.0  # 200 + 50 + 100 + 50 ticks at 100 Hz

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from launcher import supervisor
+from launcher.restarts import Happening, Restarts
 from launcher.supervisor import End, Interrupts, OrderlyEnd, Supervisor
+from launcher.vitals import Vitals
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 
 CHILD = Path(__file__).with_name("children.py")
@@ -27,10 +29,17 @@ def children(directory: Path, behaviours: Mapping[str, Sequence[str]]) -> dict[s
 
 
 def supervise(
-    directory: Path, behaviours: Mapping[str, Sequence[str]], act: Callable[[Interrupts], None]
+    directory: Path,
+    behaviours: Mapping[str, Sequence[str]],
+    act: Callable[[Interrupts], None],
+    restarts: Restarts | None = None,
+    vitals: Vitals | None = None,
+    tell: Callable[[Happening], None] = lambda happening: None,
 ) -> End:
     """Supervise four fakes; `act` is called once, when all of them are ready."""
-    fakes = Supervisor(children(directory, behaviours), directory)
+    fakes = Supervisor(
+        children(directory, behaviours), directory, restarts=restarts, vitals=vitals, tell=tell
+    )
     interrupts = Interrupts()
     acted = False
 
@@ -73,7 +82,9 @@ def test_the_env_servers_own_end_is_the_normal_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("process", "code"), [(LEARNER, 3), (AGENT, 0), (ENV_SERVER, 2)])
-def test_any_other_death_ends_the_run_loudly(process: str, code: int, tmp_path: Path) -> None:
+def test_without_restarts_any_other_death_ends_the_run_loudly(
+    process: str, code: int, tmp_path: Path
+) -> None:
     end = supervise(tmp_path, {process: ["ends", str(code)]}, never)
     assert end.reason == "failed"
     (failure,) = end.failures
@@ -83,7 +94,7 @@ def test_any_other_death_ends_the_run_loudly(process: str, code: int, tmp_path: 
     assert ended(tmp_path) == [process, *rest]
 
 
-def test_a_process_killed_from_outside_is_a_failure(tmp_path: Path) -> None:
+def test_without_restarts_a_process_killed_from_outside_is_a_failure(tmp_path: Path) -> None:
     def murder(interrupts: Interrupts) -> None:
         os.kill(int((tmp_path / f"{RECORDER}.ready").read_text()), KILL)
 

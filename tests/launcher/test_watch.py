@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from launcher.restarts import Happening, What
 from launcher.watch import Watch
 from rtcore.channels import ENV_SERVER, LEARNER
 from rtcore.messages import Event
@@ -77,3 +78,56 @@ def test_events_and_the_phase() -> None:
     assert phase is not None
     assert phase.phase == "hold"
     assert list(watch.events) == [(LEARNER, event)]
+
+
+def test_the_tally_of_a_life_that_was_killed_completes_what_was_heard() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, seq=3, counters={"ticks": 90, "missed": 2}, returns=[episode(0, 1.0)]), 1)
+    watch.feed_final(
+        [
+            ledger(ENV_SERVER, seq=0, final=False, counters={"ticks": 100, "missed": 1}),
+            ledger(LEARNER, seq=0, final=False, counters={"learned": 4}),  # died before its first message
+        ]
+    )
+    (killed,) = watch.stats()[ENV_SERVER]
+    assert killed.counters == {"ticks": 100, "missed": 2}
+    assert [one.value for one in killed.returns] == [1.0]
+    assert watch.totals(LEARNER).counters["learned"] == 4
+
+
+def happening(what: What, process: str = LEARNER) -> Happening:
+    return Happening(5, process, what, None if what == "restarted" else -9, f"{process} {what}")
+
+
+def test_between_two_lives_nothing_is_known_of_a_process() -> None:
+    watch = Watch(100.0)
+    for seq in range(3):
+        watch.feed(ledger(LEARNER, seq=seq, at_ns=seq * SECOND // 4, counters={"learned": seq}), SECOND)
+    watch.happened(happening("died"))
+    assert watch.down == {LEARNER}
+    assert not watch.heard(LEARNER)
+    assert watch.health(LEARNER, SECOND) == "missing"
+    assert watch.rate(LEARNER, "learned") is None
+    assert watch.totals(LEARNER).counters["learned"] == 2
+    watch.happened(happening("restarted"))
+    watch.happened(happening("stuck", ENV_SERVER))
+    assert (watch.down, watch.restarts) == ({ENV_SERVER}, {LEARNER: 1})
+    assert [one.what for one in watch.happenings] == ["died", "restarted", "stuck"]
+
+
+def test_the_phase_is_that_of_the_newest_life_that_knows_one() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(LEARNER, incarnation=1, windows=[notice(3, "hold")]), 1)
+    watch.feed(ledger(LEARNER, incarnation=2), 2)
+    phase = watch.phase()
+    assert phase is not None and phase.window == 3
+
+
+def test_the_lives_of_strangers_are_bounded() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, incarnation=1, counters={"ticks": 5}), 0)
+    for incarnation in range(2, 1200):
+        watch.feed(ledger(ENV_SERVER, incarnation=incarnation, counters={"ticks": 0}), 0)
+    watch.feed(ledger(ENV_SERVER, incarnation=1, seq=1, counters={"ticks": 6}), 0)
+    assert watch.refused == 199
+    assert watch.totals(ENV_SERVER).counters["ticks"] == 6

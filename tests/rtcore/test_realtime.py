@@ -171,7 +171,7 @@ show(realtime.apply(plan))
 """)
     assert placed["scheduler"] == "SCHED_OTHER"
     # Locking within the limit of 64 KiB fails, for an interpreter is larger.
-    assert (placed["memory_locked"], placed["missing"]) == (False, [FIFO, MEMORY])
+    assert (placed["memory_locked"], placed["missing"]) == (False, [MEMORY, FIFO])
 
 
 def test_no_fifo_without_pinning() -> None:

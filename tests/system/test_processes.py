@@ -221,15 +221,3 @@ def test_any_process_may_be_first_and_a_late_learner_is_picked_up(
     assert stats["learner"].counters["learned"] == stats["env_server"].counters["produced"]
     assert stats["agent_service"].counters["policies.adopted"] >= 3
     assert len(columns(run / "recording.rrd", "/env/reward")[0]) == stats["env_server"].counters["ticks"]
-
-
-def test_a_process_that_dies_ends_the_run_loudly(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
-        wait_for_ticks(run, process)
-        victim = int(subprocess.check_output(["pgrep", "-f", f"agent_service --run {run}"]).split()[0])
-        os.kill(victim, signal.SIGKILL)
-        output = finish(process, 30)
-    assert process.returncode == 1
-    assert "agent_service ended unexpectedly (signal SIGKILL)" in output
-    assert "agent_service" in summary_of(run)["ended"]
