@@ -68,9 +68,10 @@ def test_a_collection_is_an_excuse_while_evidence_is_gathered() -> None:
     assert evidence.excuse(1).collector_ns == 0
 
 
-def burn(core: int, cpu_ns: int) -> None:
-    """Compute for `cpu_ns` on `core`, without the interpreter: hashing lets go of it."""
+def burn(core: int, cpu_ns: int, together: threading.Barrier) -> None:
+    """Compute for `cpu_ns` on `core`, once all are there, without the interpreter: hashing lets go of it."""
     os.sched_setaffinity(0, {core})
+    together.wait(20.0)
     work, ballast = hashlib.sha256(), bytes(1 << 20)
     end_ns = time.thread_time_ns() + cpu_ns
     while time.thread_time_ns() < end_ns:
@@ -83,10 +84,11 @@ def test_a_wait_for_a_core_is_an_excuse_of_the_thread_that_waited() -> None:
 
     def act() -> None:
         evidence.excuse(1)
-        rivals = [threading.Thread(target=burn, args=(core, 60_000_000)) for _ in range(3)]
+        together = threading.Barrier(4)
+        rivals = [threading.Thread(target=burn, args=(core, 60_000_000, together)) for _ in range(3)]
         for rival in rivals:
             rival.start()
-        burn(core, 20_000_000)
+        burn(core, 8_000_000, together)
         starved_ns.append(evidence.excuse(1).starved_ns)
         starved_ns.append(evidence.excuse(1).starved_ns)
         for rival in rivals:
@@ -96,6 +98,7 @@ def test_a_wait_for_a_core_is_an_excuse_of_the_thread_that_waited() -> None:
         acting = threading.Thread(target=act)
         acting.start()
         acting.join()
-    # four threads share the core: 20 ms of work take 80, and 60 of these are waiting
-    assert starved_ns[0] > 30_000_000
+    # four threads share the core: 8 ms of work take 32, and 24 of these are waiting; on a core that others
+    # load as well it is more, and must stay below the 100 ms beyond which a wait is nobody's excuse
+    assert starved_ns[0] > 10_000_000
     assert starved_ns[1] < starved_ns[0] / 2
