@@ -85,7 +85,7 @@ def test_a_wait_for_a_core_is_an_excuse_of_the_thread_that_waited() -> None:
     def act() -> None:
         evidence.excuse(1)
         together = threading.Barrier(4)
-        rivals = [threading.Thread(target=burn, args=(core, 60_000_000, together)) for _ in range(3)]
+        rivals = [threading.Thread(target=burn, args=(core, 20_000_000, together)) for _ in range(3)]
         for rival in rivals:
             rival.start()
         burn(core, 8_000_000, together)
@@ -98,7 +98,7 @@ def test_a_wait_for_a_core_is_an_excuse_of_the_thread_that_waited() -> None:
         acting = threading.Thread(target=act)
         acting.start()
         acting.join()
-    # four threads share the core: 8 ms of work take 32, and 24 of these are waiting; on a core that others
-    # load as well it is more, and must stay below the 100 ms beyond which a wait is nobody's excuse
-    assert starved_ns[0] > 10_000_000
+    # four threads share the core: 8 ms of work take 32, and 24 of these are waiting; 60 if the others come
+    # first, which is still less than the 100 ms beyond which a wait is nobody's excuse
+    assert starved_ns[0] > 5_000_000
     assert starved_ns[1] < starved_ns[0] / 2
