@@ -25,7 +25,10 @@ def serve(process: Process) -> None:
     )
     process.bus.serve(channels.LEARNER, service.command)
     process.bus.declare_alive(channels.LEARNER)
-    with background(service.outbox.run, name="outbox", ends=process.stop):
+    with (
+        background(service.outbox.run, name="outbox", ends=process.stop),
+        background(service.keeper.run, name="checkpoints", ends=process.stop),
+    ):
         try:
             service.run(process.stop)
         finally:

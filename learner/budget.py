@@ -21,10 +21,24 @@ class UpdateBudget:
         self._waiting = config.learning_starts
         self._hold_share = SHARE[config.hold_learning]
         self._credit = 0.0
+        self.spent = 0
 
-    def resume(self, transitions: int) -> None:
-        """Count in what an earlier learner left in the replay; it is no reason for new steps."""
+    @property
+    def earned(self) -> float:
+        """Steps earned so far, earlier learners of the run included."""
+        return self._credit + self.spent
+
+    def resume(self, transitions: int, earned: float, spent: int) -> None:
+        """Go on after an earlier learner, which left so many transitions in the replay.
+
+        Args:
+            transitions: those that it waited for need not be waited for again.
+            earned: by all of them.
+            spent: by the steps that are in the algorithm as it was restored; what else was spent is spent
+                again, because those steps are lost.
+        """
         self._waiting = max(0, self._waiting - transitions)
+        self.spent, self._credit = spent, max(0.0, earned - spent)
 
     def earn(self, transitions: int, phase: Phase) -> None:
         """Take note of new transitions in the replay."""
@@ -39,6 +53,7 @@ class UpdateBudget:
     def spend(self, steps: int = 1) -> None:
         """So many gradient steps were made."""
         self._credit -= steps
+        self.spent += steps
 
 
 class TableBudget:
@@ -47,11 +62,13 @@ class TableBudget:
     In a hold with `hold_learning` "off" nothing is learned; what came is learned in the next update phase.
     """
 
+    earned, spent = 0.0, 0  # what it has read it knows itself
+
     def __init__(self, config: LearnerConfig) -> None:
         self._hold_share = SHARE[config.hold_learning]
         self._waiting = True  # an earlier learner may have left something
 
-    def resume(self, transitions: int) -> None:
+    def resume(self, transitions: int, earned: float, spent: int) -> None:
         """What an earlier learner left is looked for anyway."""
 
     def earn(self, transitions: int, phase: Phase) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,10 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
+from rtcore.files import write_atomic
+
 MANIFEST = "manifest.json"
-_SCHEMA = 2  # 1: the actor's weights were [out, in]
+_SCHEMA = 3  # 2: the place in the log was in it; 1: the actor's weights were [out, in]
 _KEEP_DIGITS = 16  # of the hash, in the tensors file's name
 
 
@@ -57,8 +58,8 @@ def save(directory: Path, state: State) -> None:
     tensors = f"state-{digest[:_KEEP_DIGITS]}.safetensors"
     manifest = {"schema": _SCHEMA, "tensors": tensors, "sha256": digest, "scalars": state.scalars}
     text = json.dumps(manifest, indent=1, allow_nan=False)
-    _replace(directory / tensors, data)
-    _replace(directory / MANIFEST, text.encode())
+    write_atomic(directory / tensors, data)
+    write_atomic(directory / MANIFEST, text.encode())
     for path in directory.glob("state-*.safetensors"):
         if path.name != tensors:
             path.unlink()
@@ -109,17 +110,3 @@ def require_fit(found: State, wanted: State, *, same: tuple[str, ...]) -> None:
 
 def _kinds(state: State) -> dict[str, str]:
     return {name: f"{array.dtype}{list(array.shape)}" for name, array in state.tensors.items()}
-
-
-def _replace(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".new")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

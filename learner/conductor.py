@@ -63,12 +63,16 @@ class Conductor:
 
     A unit's iterate is due `lead_ns` before the unit ends, so that its stamp is within the unit and,
     for the last one, within the update phase (stamp <= t_m + G_m).
+
+    Attributes:
+        position: where the run time told last lies.
+        settled: (window, g) of the newest iterate that was due or missed: it will not be again.
     """
 
     def __init__(self, windows: WindowClock) -> None:
         self._windows = windows
         self._shown: tuple[Window, Phase] | None = None  # as last announced
-        self._settled = (-1, 0)  # newest iterate that was due: (window, g)
+        self.settled = (-1, 0)
         self._paused = False
         self._worked = False  # the policy was to be improved at some time of the present unit
         self.position: Position | None = None
@@ -82,6 +86,11 @@ class Conductor:
     def paused(self) -> bool:
         """Whether an operator holds the policy."""
         return self._paused
+
+    def go_on_from(self, settled: tuple[int, int], *, paused: bool) -> None:
+        """Go on after an earlier learner of the run. Call it before the first `advance`."""
+        self.settled = max(self.settled, settled)
+        self._paused = paused
 
     def pause(self, run_time_ns: int) -> list[Happening]:
         """An operator's hold: no improvement and nothing published until `resume`."""
@@ -107,16 +116,16 @@ class Conductor:
             yield from self._enter(run_time_ns)
         assert self.position is not None
         iterate = (self.position.window.m, self.position.iterate)
-        if self.improving and iterate > self._settled and run_time_ns >= self.position.unit_end_ns - lead_ns:
-            self._settled = iterate
+        if self.improving and iterate > self.settled and run_time_ns >= self.position.unit_end_ns - lead_ns:
+            self.settled = iterate
             yield PublishDue(*iterate_of(self.position))
 
     def _leave(self, position: Position) -> Iterator[Happening]:
         """The unit that `position` is in is over."""
         yield UnitEnded(position.unit)
         iterate = (position.window.m, position.iterate)
-        if position.phase == "update" and iterate > self._settled:
-            self._settled = iterate
+        if position.phase == "update" and iterate > self.settled:
+            self.settled = iterate
             if self._worked:  # a unit that an operator held throughout misses nothing
                 yield PublishMissed(*iterate_of(position))
 

@@ -1,7 +1,7 @@
 """What acted when, in a finite world: the policies, the forecasts behind them and the ticks of each.
 
-From this file and the run's configuration the exact regret of a run can be computed afterwards. The training
-thread only counts and puts into a queue; whoever sends the policies writes.
+From this file and the run's configuration the exact regret of a run can be computed afterwards. Whoever sends
+the policies writes; the training thread counts, puts into a queue, and writes the ticks of a unit as it ends.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def read(path: Path) -> Contents:
         end = begin + int.from_bytes(data[size:begin], "little")
         try:
             entry = _DECODER.decode(data[begin:end]) if end <= len(data) else None
-        except msgspec.DecodeError:
+        except (ValueError, RecursionError):
             entry = None
         if entry is None:
             break
@@ -135,12 +135,24 @@ class Tally:
 
     Args:
         position: (incarnation, seq) before which everything is counted already.
+        pending: what an earlier one had not told.
     """
 
-    def __init__(self, position: tuple[int, int] = (-1, 0)) -> None:
+    def __init__(self, position: tuple[int, int] = (-1, 0), pending: Acted | None = None) -> None:
         self._position = position
-        self._first: Step | None = None  # of what is counted but not told yet
+        self._unit: tuple[int, int] | None = None  # of what is counted but not told yet: incarnation, unit
         self._ticks: Counter[int] = Counter()
+        if pending is not None and (reached := (pending.incarnation, pending.next_seq)) > position:
+            self._position, self._unit = reached, (pending.incarnation, pending.unit)
+            self._ticks.update(pending.ticks)
+
+    @property
+    def pending(self) -> Acted | None:
+        """What is counted but not told yet."""
+        if self._unit is None:
+            return None
+        incarnation, seq = self._position
+        return Acted(incarnation=incarnation, next_seq=seq, unit=self._unit[1], ticks=dict(self._ticks))
 
     def take(self, steps: Sequence[Step]) -> list[Acted]:
         """Count steps, in order; returns what is complete. A reset counts nothing: no action was taken."""
@@ -148,13 +160,12 @@ class Tally:
         for step in steps:
             if (step.incarnation, step.seq) < self._position:
                 continue
-            first = self._first
-            if first is not None and (first.incarnation, first.unit) != (step.incarnation, step.unit):
+            if self._unit not in (None, (step.incarnation, step.unit)):
                 told += self.finish()
             self._position = (step.incarnation, step.seq + 1)
             if step.episode_tick == 0:
                 continue
-            self._first = self._first or step
+            self._unit = step.incarnation, step.unit
             self._ticks[FALLBACK if step.missed else step.policy_version] += 1
             if self._ticks.total() >= MOST_TICKS:
                 told += self.finish()
@@ -162,13 +173,10 @@ class Tally:
 
     def finish(self) -> list[Acted]:
         """What is left."""
-        first, ticks = self._first, dict(self._ticks)
-        self._first = None
+        told = [] if self.pending is None else [self.pending]
+        self._unit = None
         self._ticks.clear()
-        if first is None:
-            return []
-        incarnation, seq = self._position
-        return [Acted(incarnation=incarnation, next_seq=seq, unit=first.unit, ticks=ticks)]
+        return told
 
 
 @runtime_checkable
@@ -182,23 +190,26 @@ class Forecasting(Protocol):
 class Diary:
     """Writes the diary of a finite world, and nothing in a continuous one.
 
-    `flush` writes; all else puts into a queue and never waits. Counts `diary.errors` (entries that did not
-    fit on the disk) and `diary.torn`. An entry is in the operating system's hands once it is written, so a
-    kill of this process loses none of those; the machine's end may.
+    `flush` writes, and `acted` once a unit; all else puts into a queue and never waits. Counts `diary.errors`
+    (entries that did not fit on the disk) and `diary.torn`. An entry is in the operating system's hands once
+    it is written, so a kill of this process loses none of those; the machine's end may.
     """
 
     def __init__(self, path: Path, clock: Clock, ledger: Ledger) -> None:
         self._path = path
-        self._clock = clock
-        self._ledger = ledger
+        self._clock, self._ledger = clock, ledger
         self._waiting: SimpleQueue[Entry] = SimpleQueue()
         self._writing = threading.Lock()
         self._tally: Tally | None = None
-        self._size = 0
-        self._t0_ns = 0
+        self._size = self._t0_ns = 0
 
-    def meet(self, spec: Spec) -> None:
-        """Learn what world it is, and go on after what an earlier learner of this run has written."""
+    @property
+    def pending(self) -> Acted | None:
+        """What was lived and is not written yet: give it to `meet` of a later learner."""
+        return None if self._tally is None else self._tally.pending
+
+    def meet(self, spec: Spec, pending: Acted | None = None) -> None:
+        """Learn what world it is; go on after what an earlier learner of the run wrote or had `pending`."""
         if not spec.states:
             return
         try:
@@ -209,12 +220,12 @@ class Diary:
         self._ledger.count("diary.torn", found.torn)
         self._size, self._t0_ns = found.size, spec.t0_ns
         told = ((one.incarnation, one.next_seq) for one in found.entries if isinstance(one, Acted))
-        self._tally = Tally(max(told, default=(-1, 0)))
+        self._tally = Tally(max(told, default=(-1, 0)), pending)
 
     def acted(self, steps: Sequence[Step]) -> None:
-        """Count what was lived, each step once and in order."""
+        """Count what was lived, each step once and in order; write what is not `pending` any more."""
         if self._tally is not None:
-            self._put(self._tally.take(steps))
+            self._put(self._tally.take(steps), at_once=True)
 
     def window(self, window: Window, unit: int, algorithm: object) -> None:
         """A window was entered in `unit`, and `algorithm` has begun it."""
@@ -223,10 +234,9 @@ class Diary:
         tables = algorithm.window_start()
         if tables is not None:
             forecast, log_policy = tables
-            states, actions = forecast.shape
             entry = Forecast(
                 window=window.m, start=window.start, update=window.update, hold=window.hold, unit=unit,
-                states=states, actions=actions,
+                states=forecast.shape[0], actions=forecast.shape[1],
                 forecast=forecast.astype("<f8").tobytes(), log_policy=log_policy.astype("<f8").tobytes(),
             )  # fmt: skip
             self._put([entry])
@@ -250,8 +260,7 @@ class Diary:
     def finish(self) -> None:
         """Nothing more will be lived: write what is left."""
         if self._tally is not None:
-            self._put(self._tally.finish())
-            self.flush()
+            self._put(self._tally.finish(), at_once=True)
 
     def flush(self) -> None:
         """Write all that waits. For any thread."""
@@ -263,9 +272,11 @@ class Diary:
                     return
                 self._write(entry)
 
-    def _put(self, entries: Sequence[Entry]) -> None:
+    def _put(self, entries: Sequence[Entry], *, at_once: bool = False) -> None:
         for entry in entries:
             self._waiting.put(entry)
+        if at_once and entries:
+            self.flush()
 
     def _write(self, entry: Entry) -> None:
         """Append one entry whole, or leave the file as it was."""

@@ -1,12 +1,15 @@
 """What the learner tells the others, off its training thread.
 
 A put on these channels may wait seconds for a stalled reader, so a thread of its own makes it. The
-newest policy also goes to a file, for an agent that comes while no learner lives.
+newest policy also goes to a file, for an agent that comes while no learner lives, and to the file first:
+a learner that is killed in between leaves no version behind that a later one would give to other weights.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
@@ -16,7 +19,7 @@ from learner.diary import NAME, Diary
 from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.clock import Clock
-from rtcore.files import write_atomic
+from rtcore.files import sync, write_atomic
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
 from rtcore.messages import Policy, WindowNotice
@@ -24,6 +27,24 @@ from rtcore.run_dir import RunDir
 from rtcore.signing import NoSigner, Signer
 
 WAIT_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class _Again:
+    """A policy of an earlier learner, for whoever has not got it."""
+
+    policy: Policy
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    """What a file shall hold."""
+
+    path: Path
+    data: bytes
+
+
+_Item = Policy | WindowNotice | _Again | _File
 
 
 class Outbox:
@@ -40,7 +61,7 @@ class Outbox:
         self._signer = signer or NoSigner()
         self._clock = clock
         self._ledger = ledger
-        self._waiting: SimpleQueue[Policy | WindowNotice | tuple[Path, bytes]] = SimpleQueue()
+        self._waiting: SimpleQueue[_Item] = SimpleQueue()
         self._policies = bus.publisher(channels.POLICY)
         self._windows = bus.publisher(channels.WINDOW)
         self._policy_path = run_dir.policy_path
@@ -52,7 +73,11 @@ class Outbox:
 
     def keep(self, path: Path, data: bytes) -> None:
         """Write a file whole, in place of the one before; never waits."""
-        self._waiting.put((path, data))
+        self._waiting.put(_File(path, data))
+
+    def republish(self, policy: Policy) -> None:
+        """Send the newest policy of an earlier learner once more; never waits."""
+        self._waiting.put(_Again(policy))
 
     def flush(self) -> None:
         """Send all that waits."""
@@ -71,21 +96,38 @@ class Outbox:
             self.diary.flush()
         self.flush()
 
-    def _send(self, message: Policy | WindowNotice | tuple[Path, bytes]) -> None:
-        if isinstance(message, WindowNotice):
-            self._windows.put(message)
-            self.diary.sent(message)
-        elif isinstance(message, Policy):
-            message = self._signer.sign(message)
-            self._policies.put(message)
-            self.diary.sent(message)
-            self._write(self._policy_path, msgspec.msgpack.encode(message), f"policy {message.version}")
-        else:
-            self._write(*message, message[0].name)
+    def _send(self, item: _Item) -> None:
+        match item:
+            case WindowNotice():
+                self._tell_diary(item)
+                self._windows.put(item)
+            case Policy():
+                self._tell_diary(item)
+                signed = self._signer.sign(item)
+                self._publish(signed)
+            case _Again(policy):
+                self._policies.put(self._signer.sign(policy))
+            case _File(path, data):
+                self._write(path, lambda path: write_atomic(path, data), path.name)
 
-    def _write(self, path: Path, data: bytes, what: str) -> None:
+    def _tell_diary(self, message: Policy | WindowNotice) -> None:
+        """Before anybody can act on it: what acts is in the diary, whoever is killed."""
+        self.diary.sent(message)
+        self.diary.flush()
+
+    def _publish(self, policy: Policy) -> None:
+        """To the file, which outlives this process at once; to the agents; then to the disk."""
+        data, what = msgspec.msgpack.encode(policy), f"policy {policy.version}"
+        written = self._write(self._policy_path, lambda path: write_atomic(path, data, synced=False), what)
+        self._policies.put(policy)
+        if written:
+            self._write(self._policy_path, sync, what)
+
+    def _write(self, path: Path, write: Callable[[Path], None], what: str) -> bool:
         try:
-            write_atomic(path, data)
-        except OSError as error:  # a full disk, say: the policy is on the bus all the same
+            write(path)
+        except OSError as error:  # a full disk, say: the policy goes to the bus all the same
             self._ledger.count(f"{path.stem}_file.errors")
             self._ledger.event(self._clock.now_ns(), "WARN", f"{what} not on disk: {error}")
+            return False
+        return True

@@ -1,4 +1,4 @@
-"""The iterates as the agents get them: numbered, stamped, hashed."""
+"""What the others are told: the iterates, numbered, stamped and hashed, and the phases."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from learner.algorithm import Algorithm
-from learner.conductor import PublishDue
+from learner.conductor import PhaseEntered, PublishDue
 from learner.outbox import Outbox
 from rtcore.clock import Clock
 from rtcore.ledger import Ledger
@@ -16,17 +16,16 @@ from rtcore.windows import WindowClock
 
 
 class Publication:
-    """Publishes iterates, never in a hold.
+    """Announces phases, and publishes iterates, never in a hold.
 
     Counts `published`, `withheld` (an iterate whose time was over before it was ready), and, from the
     phases as they were announced, `published_in_hold`, which must stay 0. An unchanged policy is not
     published again.
     """
 
-    def __init__(self, algo: str, notices: Sequence[WindowNotice], outbox: Outbox, ledger: Ledger) -> None:
-        """`notices` are the announced phases; the service appends to them."""
+    def __init__(self, algo: str, outbox: Outbox, ledger: Ledger) -> None:
         self._algo = algo
-        self._notices = notices
+        self._notices: list[WindowNotice] = []  # the phases as announced
         self._outbox = outbox
         self._ledger = ledger
         self._version = 0
@@ -66,6 +65,23 @@ class Publication:
             created_ns=created_ns,
         )
         self._outbox.put(policy)
+
+    def announce(self, entered: PhaseEntered, spec: Spec) -> None:
+        """Tell everybody that a phase began."""
+        window = entered.window
+        notice = WindowNotice(
+            window=window.m,
+            start_unit=window.start,
+            update_units=window.update,
+            hold_units=window.hold,
+            phase=entered.phase,
+            at_ns=spec.t0_ns + entered.start_ns,
+            reason=entered.reason,
+        )
+        self._notices.append(notice)
+        self._ledger.windows(self._notices)
+        self.check()
+        self._outbox.put(notice)
 
     def check(self) -> None:
         """Hold the stamps against the phases as announced: `published_in_hold` must stay 0."""

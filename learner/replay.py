@@ -7,20 +7,19 @@ finite world are their numbers.
 from __future__ import annotations
 
 import hashlib
-import json
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from learner.recency import RecentUnits
+from learner.columns import Bools, Columns, Floats, in_memory
+from learner.marks import Record
+from learner.recency import RecentUnits, Units
+from learner.store import Store
+from rtcore.epoch import this_boot
 
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-
-_SCHEMA = 2  # 1: without the number of transitions ever added
-_CURSOR = "cursor.json"
+__all__ = ["Batch", "Columns", "Floats", "Replay", "ReplayError", "make_batch", "open_replay"]
 
 
 class ReplayError(ValueError):
@@ -38,18 +37,6 @@ class Batch:
     terminated: Bools  # [B]: bootstrap with 0; a truncated transition is not terminated
 
 
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """The ring's storage, one row per transition."""
-
-    observation: Floats
-    action: Floats
-    reward: Floats
-    next_observation: Floats
-    terminated: Bools
-    unit: NDArray[np.int32]  # t, rises with insertion
-
-
 def make_batch(size: int, observation_dim: int, action_dim: int) -> Batch:
     """Zeroed arrays for `size` transitions."""
     return Batch(
@@ -64,35 +51,52 @@ def make_batch(size: int, observation_dim: int, action_dim: int) -> Batch:
 class Replay:
     """A ring of `capacity` transitions; the newest overwrites the oldest once it is full.
 
-    In memory it takes the pages of its arrays only as transitions come in. For one in files, and one
-    that was there before, see `open_replay`. Its length is the number of transitions held.
+    In memory it takes the pages of its arrays only as transitions come in. For one in files, see
+    `open_replay`: of that, what was committed survives the process. Its length is the number of transitions
+    held.
 
     Attributes:
         added: transitions ever added; they are numbered from 0, so the newest is `added` - 1.
         raised_units: transitions that came with an older unit than their predecessor's and were
             filed under the newest one, so that units rise with insertion.
+        fault: why the disk failed a replay in files, which has been in memory since; None: it has not.
     """
 
     def __init__(self, capacity: int, observation_dim: int, action_dim: int) -> None:
         self.capacity, self.observation_dim, self.action_dim = capacity, observation_dim, action_dim
-        layout = _layout(capacity, observation_dim, action_dim)
-        self._columns = Columns(**{name: np.empty(shape, dtype) for name, (shape, dtype) in layout.items()})
+        self._columns = in_memory(capacity, observation_dim, action_dim)
+        self._rows = capacity  # of the ring; in files some more than it holds
         self._head = 0  # where the next transition goes
         self._size = 0
-        self._directory: Path | None = None
+        self._store: Store | None = None
+        self._until = sys.maxsize  # number of the first transition that there is no room for yet
+        self._committed = 0  # transitions in files when the disk failed
         self.added = 0
         self.raised_units = 0
+        self.fault: OSError | None = None
 
     def __len__(self) -> int:
         return self._size
 
     @classmethod
-    def over(cls, columns: Columns, head: int, size: int, added: int, directory: Path) -> Replay:
-        """A replay over arrays that are mapped from files in `directory`."""
-        replay = cls(len(columns.reward), columns.observation.shape[1], columns.action.shape[1])
-        replay._columns, replay._head, replay._size = columns, head, size
-        replay._directory, replay.added = directory, added
+    def over(cls, store: Store, capacity: int, observation_dim: int, action_dim: int) -> Replay:
+        """A replay over files, with what counts in them."""
+        replay, found = cls(capacity, observation_dim, action_dim), store.newest
+        replay._columns, replay._store = store.columns, store
+        replay._rows = len(store.columns.reward)
+        replay._head, replay._size = found.added % replay._rows, found.added - found.oldest
+        replay.added = replay._until = found.added
         return replay
+
+    @property
+    def unbacked(self) -> int:
+        """Transitions that are in memory alone, because the disk failed."""
+        return 0 if self.fault is None else self.added - self._committed
+
+    @property
+    def committed(self) -> Record | None:
+        """What survives the process; None of a replay in memory."""
+        return None if self._store is None else self._store.newest
 
     @property
     def newest_unit(self) -> int:
@@ -112,6 +116,8 @@ class Replay:
         if unit < self.newest_unit:
             self.raised_units += 1
             unit = self.newest_unit
+        if self.added == self._until:
+            self._make_room()
         row, columns = self._head, self._columns
         columns.observation[row] = observation
         columns.action[row] = action
@@ -119,7 +125,7 @@ class Replay:
         columns.next_observation[row] = next_observation
         columns.terminated[row] = terminated
         columns.unit[row] = unit
-        self._head = (row + 1) % self.capacity
+        self._head = (row + 1) % self._rows
         self._size = min(self._size + 1, self.capacity)
         self.added += 1
 
@@ -139,12 +145,10 @@ class Replay:
 
     def count_since(self, unit: int) -> int:
         """How many of the newest transitions belong to `unit` or later."""
-        units = self._columns.unit
-        newer = units[: self._head]  # written since the ring last wrapped, in order
+        older, newer = self._units()
         sought = np.int32(unit)  # of the column's type: for any other, the whole column would be converted
-        count = self._head - int(np.searchsorted(newer, sought))
-        if count == self._head and self._size == self.capacity:
-            older = units[self._head :]
+        count = len(newer) - int(np.searchsorted(newer, sought))
+        if count == len(newer):
             count += len(older) - int(np.searchsorted(older, sought))
         return count
 
@@ -197,8 +201,15 @@ class Replay:
         return count
 
     def _by_age(self, count: int) -> RecentUnits:
-        units, end = self._columns.unit, self._head or self._size
-        return RecentUnits(units[end : self._size], units[:end], count)
+        return RecentUnits(*self._units(), count)
+
+    def _units(self) -> tuple[Units, Units]:
+        """Those held, rising: the older ones in the ring's end, if it has wrapped, and those after."""
+        units, end = self._columns.unit, self._head or self._rows
+        first = end - self._size
+        if first < 0:
+            return units[first:], units[:end]
+        return units[:0], units[first:end]
 
     def content_hash(self) -> str:
         """SHA-256 over the transitions held, oldest first."""
@@ -208,79 +219,76 @@ class Replay:
             digest.update(np.take(getattr(self._columns, column.name), rows, axis=0, mode="wrap").tobytes())
         return digest.hexdigest()
 
-    def flush(self) -> None:
-        """Write a file-backed replay to its directory; in memory, do nothing."""
-        if self._directory is None:
-            return
-        for column in fields(self._columns):
-            stored = getattr(self._columns, column.name)
-            if isinstance(stored.base, np.memmap):
-                stored.base.flush()
-        cursor = {
-            **_shape(self.capacity, self.observation_dim, self.action_dim),
-            "head": self._head,
-            "size": self._size,
-            "added": self.added,
-        }
-        temporary = self._directory / f"{_CURSOR}.new"
-        temporary.write_text(json.dumps(cursor))
-        temporary.replace(self._directory / _CURSOR)
+    # -- durability
+
+    def commit(self, note: bytes) -> None:
+        """Let everything added so far survive the process, and `note` with it, or, if the process ends within
+        this call, nothing since the last commit. A replay in memory forgets it.
+
+        Raises:
+            ValueError: the note is too long; nothing has changed then.
+        """
+        if self._store is not None:
+            self._store.commit(self.added, self.added - self._size, note)
+            self._until = self.added  # to be asked for anew
+
+    def sync(self, record: Record, *, last: bool = False) -> None:
+        """Let what was `committed` survive the host as well. For any thread; see `Store.sync`.
+
+        Raises:
+            OSError: the disk failed.
+        """
+        if self._store is not None:
+            self._store.sync(record, last=last)
+
+    def _make_room(self) -> None:
+        """Have the files take further rows; without a place on the disk, go on in memory."""
+        assert self._store is not None
+        try:
+            self._until = self._store.room(self.added)
+        except OSError as error:
+            self.fault, self._until = error, sys.maxsize
+            self._committed, self._store = self._store.newest.added, None
+            self._columns = self._copied()
+
+    def _copied(self) -> Columns:
+        """The columns in memory, with what is held."""
+        copy = in_memory(self._rows, self.observation_dim, self.action_dim)
+        first = self._head - self._size
+        for part in (
+            slice(max(0, first), self._head),
+            slice(first % self._rows if first < 0 else self._rows, None),
+        ):
+            for column in fields(copy):
+                getattr(copy, column.name)[part] = getattr(self._columns, column.name)[part]
+        return copy
 
 
-def open_replay(directory: Path, capacity: int, observation_dim: int, action_dim: int) -> Replay:
-    """The replay in `directory`, as of its last `flush`; an empty one if there is none.
+def open_replay(
+    directory: Path, capacity: int, observation_dim: int, action_dim: int, *, boot: str | None = None
+) -> Replay:
+    """The replay in `directory` with all that was committed to it; an empty one if there is none.
+
+    Where the disk has no place for it, it is in memory and says why in `fault`.
+
+    Args:
+        directory: made if need be.
+        capacity: transitions held.
+        observation_dim: of the world.
+        action_dim: of the world.
+        boot: of the host; None: this one. After another one only what was synced counts.
 
     Raises:
-        ReplayError: the one there has another capacity or other dimensions, or cannot be read.
+        ReplayError: the one there has another capacity or other dimensions, is damaged, or older.
     """
-    directory.mkdir(parents=True, exist_ok=True)
-    wanted = _shape(capacity, observation_dim, action_dim)
-    head, size, added = _read_cursor(directory, wanted)
-    columns = {}
-    for name, (shape, dtype) in _layout(capacity, observation_dim, action_dim).items():
-        path = directory / f"{name}.bin"
-        if size and not path.is_file():
-            raise ReplayError(f"{path}: missing")
-        mapped = np.memmap(path, dtype, "r+" if size else "w+", shape=shape)
-        columns[name] = np.asarray(mapped)  # a plain view: indexing a memmap object is slower
-    return Replay.over(Columns(**columns), head, size, added, directory)
-
-
-def _read_cursor(directory: Path, wanted: dict[str, int]) -> tuple[int, int, int]:
     try:
-        found = json.loads((directory / _CURSOR).read_text())
-        head, size, added = int(found["head"]), int(found["size"]), int(found.get("added", 0))
-    except FileNotFoundError:
-        return 0, 0, 0
-    except (ValueError, KeyError, TypeError) as error:
-        raise ReplayError(f"{directory / _CURSOR}: not readable ({error})") from None
-    differences = [
-        f"{key} {found.get(key)} (wanted {value})" for key, value in wanted.items() if found.get(key) != value
-    ]
-    if differences:
-        raise ReplayError(f"{directory}: {', '.join(differences)}")
-    if not (0 <= size <= wanted["capacity"] and 0 <= head < wanted["capacity"] and size <= added):
-        raise ReplayError(f"{directory / _CURSOR}: head {head}, size {size}, added {added}: outside the ring")
-    return head, size, added
-
-
-def _shape(capacity: int, observation_dim: int, action_dim: int) -> dict[str, int]:
-    return {
-        "schema": _SCHEMA,
-        "capacity": capacity,
-        "observation_dim": observation_dim,
-        "action_dim": action_dim,
-    }
-
-
-def _layout(
-    capacity: int, observation_dim: int, action_dim: int
-) -> dict[str, tuple[tuple[int, ...], type[np.generic]]]:
-    return {
-        "observation": ((capacity, observation_dim), np.float32),
-        "action": ((capacity, action_dim), np.float32),
-        "reward": ((capacity,), np.float32),
-        "next_observation": ((capacity, observation_dim), np.float32),
-        "terminated": ((capacity,), np.bool_),
-        "unit": ((capacity,), np.int32),
-    }
+        store = Store.open(
+            directory, capacity, observation_dim, action_dim, this_boot() if boot is None else boot
+        )
+    except OSError as error:
+        replay = Replay(capacity, observation_dim, action_dim)
+        replay.fault = error
+        return replay
+    except ValueError as error:
+        raise ReplayError(str(error)) from error
+    return Replay.over(store, capacity, observation_dim, action_dim)

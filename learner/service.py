@@ -7,12 +7,11 @@ turn of the loop and never waits; `run` repeats it in a process, `catch_up` in v
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterable
 from typing import assert_never
 
-from learner import resume
-from learner.algorithm import Algorithm, make_algorithm
+from learner import meeting, resume
+from learner.algorithm import Algorithm
 from learner.budget import TableBudget, UpdateBudget
 from learner.conductor import (
     Conductor,
@@ -23,30 +22,30 @@ from learner.conductor import (
     UnitEnded,
     WindowEntered,
 )
-from learner.intake import Intake
+from learner.gauges import Gauges
+from learner.intake import Intake, Taken
+from learner.keeper import Keeper
 from learner.orders import Orders
 from learner.outbox import Outbox
+from learner.place import Course
 from learner.power import Levers, PowerControl
 from learner.publication import Publication
-from learner.replay import open_replay
 from learner.schedule.scheduler import Scheduler
 from rtcore import channels
+from rtcore.admission import is_same_world
 from rtcore.bus import Bus
 from rtcore.clock import Clock
 from rtcore.config import TABULAR, RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Stop
-from rtcore.messages import Command, CommandReply, Phase, Spec, WindowNotice
+from rtcore.messages import Command, CommandReply, Phase, Spec, Step
 from rtcore.run_dir import RunDir
 from rtcore.signing import Signer
-from rtcore.spaces import Spaces
 
 IDLE_WAIT_S = 0.02  # nothing to learn from: wait so long for the next batch (they come every 50 ms)
 DRAIN_LIMIT_S = 2.0  # after the stop: wait so long for the env server's last batch
 LEAD_FLOOR_NS = 50_000_000  # publish at least so long before the unit ends, or a quarter of a shorter unit
-METRICS_PERIOD_NS = 250_000_000
 COUNTED = ("gradient_steps", "policy_steps", "unread")  # of the algorithm, into the ledger
-LEARNER_STREAM = 2  # keeps the learner's random numbers apart from the world's and the agent's
 
 
 class LearnerService:
@@ -70,21 +69,22 @@ class LearnerService:
         self._ledger = ledger
         self._specs = bus.latest(channels.SPEC, config.env.name)
         self.outbox = Outbox(bus, run_dir, clock, ledger, signer)
-        self._intake = Intake(bus, config.env.name, ledger, self.outbox.diary)
+        self._intake = Intake(bus, config.env.name, clock, ledger, self.outbox.diary)
+        directory = run_dir.learner_dir / resume.CHECKPOINT_DIR
+        self.keeper = Keeper(directory, config.learner.checkpoint_s, clock, ledger)
         kept = run_dir.learner_dir / resume.SCHEDULE_FILE
         self._scheduler = Scheduler(config, clock, ledger, lambda data: self.outbox.keep(kept, data))
         self._conductor = Conductor(self._scheduler.windows)
         self._orders = Orders(self._conductor, self._scheduler, clock, ledger)
         self._budget = (TableBudget if config.learner.algo in TABULAR else UpdateBudget)(config.learner)
         self._power = PowerControl(config.learner, levers, ledger)
-        self._notices: list[WindowNotice] = []
-        self._publication = Publication(config.learner.algo, self._notices, self.outbox, ledger)
+        self._gauges = Gauges(ledger)
+        self._publication = Publication(config.learner.algo, self.outbox, ledger)
         self._spec: Spec | None = None
+        self._unit_ended = False  # since the last look at the schedule
         self._on_time = False  # the learner was there before T0: the first window begins on the dot
         self._algorithm: Algorithm | None = None
         self._lead_ns = self._lead_floor_ns = LEAD_FLOOR_NS
-        self._metrics_due_ns = 0
-        self._progress: deque[tuple[int, int]] = deque(maxlen=5)  # (instant, gradient steps), 4 a second
 
     def run(self, stop: Stop) -> None:
         """Learn until stopped, then take what the env server still sends."""
@@ -131,11 +131,12 @@ class LearnerService:
 
     def close(self) -> None:
         """Account for what never came, and write the checkpoint."""
-        self._intake.finish()
+        self._learn_from(self._intake.finish())
+        self._commit()
         self._publication.check()
         if self._algorithm is not None:
-            self._ledger_metrics(self._algorithm)
-            resume.save(self._run_dir, self._algorithm, self._intake)
+            self._report(self._algorithm)
+            self.keeper.finish(resume.state(self._algorithm, self._budget))
 
     # ---- turning the crank
 
@@ -146,10 +147,21 @@ class LearnerService:
         if self._spec is None:
             return
         now_ns = self._clock.now_ns()
-        learned, steps = self._intake.take(now_ns)
-        if learned:
-            self._budget.earn(learned, self._phase)
-        self._power.watch(steps, now_ns)
+        self._power.watch(self._learn_from(self._intake.take(now_ns)), now_ns)
+
+    def _learn_from(self, parts: Iterable[Taken]) -> list[Step]:
+        steps: list[Step] = []
+        for learned, part in parts:
+            if learned:
+                self._budget.earn(learned, self._phase)
+            self._commit()
+            steps += part
+        return steps
+
+    def _commit(self) -> None:
+        """Let everything until now survive a kill, the algorithm's own state aside."""
+        conductor = self._conductor
+        self._intake.commit(Course(self._budget.earned, conductor.settled, conductor.paused))
 
     def _improve(self, algorithm: Algorithm) -> None:
         """One gradient step; of a table, as many as transitions wait."""
@@ -165,26 +177,24 @@ class LearnerService:
 
     def _meet(self, spec: Spec) -> None:
         if self._spec is not None:
-            if spec.incarnation != self._spec.incarnation:
+            if spec.incarnation != self._spec.incarnation and is_same_world(spec, self._spec):
                 text = "the env server came back; units and windows go on by its first clock"
                 self._ledger.event(self._clock.now_ns(), "WARN", text)
             return
-        self._spec = spec
+        found = meeting.meet(
+            self._config, self._run_dir, spec, self._budget, self._clock, self._ledger
+        )  # or it ends here: what does not fit stays as it is
+        self._spec, self._algorithm = spec, found.algorithm
         self._lead_ns = self._lead_floor_ns = min(LEAD_FLOOR_NS, spec.unit_ns // 4)
-        learner = self._config.learner
         self._power.meet(spec.tick_ns, self._clock.now_ns())
-        directory = self._run_dir.learner_dir / resume.REPLAY_DIR
-        replay = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
-        self._intake.meet(spec, replay)
-        seed = self._config.seed * 10 + LEARNER_STREAM
-        self._algorithm = make_algorithm(self._config, Spaces.of(spec), seed, replay)
-        version = resume.last_published(self._run_dir)
-        self._publication.go_on_from(version)
-        self._scheduler.meet(self._algorithm, resume.timetable(self._run_dir))
-        if resume.restore(self._run_dir, self._algorithm, self._intake):
-            self._budget.resume(len(replay))
-            text = f"goes on from the checkpoint: policy {version}, {len(replay)} transitions in the replay"
-            self._ledger.event(self._clock.now_ns(), "INFO", text)
+        self._intake.meet(spec, found.replay, found.place, found.counted)
+        self.keeper.meet(found.replay)
+        self._conductor.go_on_from(found.settled, paused=found.place.course.paused)
+        self._publication.go_on_from(found.published.version)
+        if found.published.policy is not None:
+            self.outbox.republish(found.published.policy)
+        self._scheduler.meet(found.algorithm, resume.timetable(self._run_dir))
+        self._commit()
 
     def _keep_schedule(self, spec: Spec) -> None:
         now_ns = self._clock.now_ns()
@@ -198,10 +208,18 @@ class LearnerService:
             self._handle_all(self._conductor.advance(0, 0), spec)
         self._handle_all(self._conductor.advance(run_ns, lead_ns), spec)
         self._handle_all(self._orders.carry_out(spec.t0_ns), spec)
-        if now_ns >= self._metrics_due_ns and self._algorithm is not None:
-            self._metrics_due_ns = now_ns + METRICS_PERIOD_NS
-            self._ledger_metrics(self._algorithm)
-            self._ledger_rate(now_ns)
+        if self._gauges.due(now_ns) and self._algorithm is not None:
+            self._report(self._algorithm)
+            self._gauges.report_rate(now_ns)
+        if self.keeper.due(now_ns) and (self._unit_ended or spec.unit_ns > self.keeper.period_ns):
+            self._checkpoint()
+        self._unit_ended = False
+
+    def _checkpoint(self) -> None:
+        assert self._algorithm is not None
+        begin_ns = self._clock.now_ns()
+        self.keeper.offer(resume.state(self._algorithm, self._budget), begin_ns)
+        self._ledger.gauge("checkpoint/pause_ms", (self._clock.now_ns() - begin_ns) / 1e6)
 
     def _handle_all(self, happenings: Iterable[Happening], spec: Spec) -> None:
         """Each in its turn: what comes next may follow from it."""
@@ -213,14 +231,17 @@ class LearnerService:
         match happening:
             case UnitEnded(unit):
                 self._algorithm.end_unit(unit)
+                self._unit_ended = True
             case WindowEntered(window, unit):
                 self._algorithm.begin_window(window, unit)
                 self.outbox.diary.window(window, unit, self._algorithm)
                 self._scheduler.entered(window)
             case PhaseEntered():
-                self._announce(happening, spec)
+                self._commit()  # an operator's hold, for one
+                self._publication.announce(happening, spec)
             case PublishDue():
                 self._handle_all(self._orders.carry_out(spec.t0_ns), spec)  # what came before comes first
+                self._commit()  # that it is settled
                 self._publish(happening, spec, self._algorithm)
             case PublishMissed(window, iterate):
                 if not self._conductor.paused:
@@ -241,22 +262,6 @@ class LearnerService:
         self._publication.improved |= algorithm.iterate(g)
         self._ledger.count("policy_steps", algorithm.policy_steps - before)
 
-    def _announce(self, entered: PhaseEntered, spec: Spec) -> None:
-        window = entered.window
-        notice = WindowNotice(
-            window=window.m,
-            start_unit=window.start,
-            update_units=window.update,
-            hold_units=window.hold,
-            phase=entered.phase,
-            at_ns=spec.t0_ns + entered.start_ns,
-            reason=entered.reason,
-        )
-        self._notices.append(notice)
-        self._ledger.windows(self._notices)
-        self._publication.check()
-        self.outbox.put(notice)
-
     # ---- small things
 
     @property
@@ -274,19 +279,9 @@ class LearnerService:
         """Keep the publication lead above the time that a step takes (slowly forgotten maximum)."""
         self._lead_ns = max(self._lead_floor_ns, 2 * duration_ns, round(0.99 * self._lead_ns))
 
-    def _ledger_metrics(self, algorithm: Algorithm) -> None:
-        for name, value in algorithm.metrics().items():
-            self._ledger.gauge(name, value)
-        self._ledger.gauge("replay_size", self._intake.replay_size)
+    def _report(self, algorithm: Algorithm) -> None:
+        self._gauges.report(algorithm, self._intake.replay_size)
         self._power.report()
-
-    def _ledger_rate(self, now_ns: int) -> None:
-        """Gradient steps per second over about the last second."""
-        done = self._ledger.counter("gradient_steps")
-        self._progress.append((now_ns, done))
-        begin_ns, begun = self._progress[0]
-        if now_ns > begin_ns:
-            self._ledger.gauge("updates_per_s", (done - begun) * 1e9 / (now_ns - begin_ns))
 
     def _describe(self) -> str:
         position = self._conductor.position

@@ -61,7 +61,7 @@ def read(path: Path) -> Epoch | None:
         return msgspec.json.decode(path.read_bytes(), type=Epoch)
     except FileNotFoundError:
         return None
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError("epoch", str(path), f"must be a run's beginning ({error})") from error
 
 

@@ -9,14 +9,34 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes, *, synced: bool = True) -> None:
     """Write a file so that, whatever happens, there is the old one or the new one, whole and on the disk.
+
+    Args:
+        path: of the file.
+        data: all of it.
+        synced: whether to wait for the disk, some ms; if not, only a process's end is survived until `sync`.
 
     Raises:
         OSError: it could not be written; the old one is untouched.
     """
-    with _written_aside(path, data) as temporary:
+    with _written_aside(path, data, synced=synced) as temporary:
         temporary.replace(path)
+    if synced:
+        _keep_names(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Wait until the disk has a file, and its name.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
     _keep_names(path.parent)
 
 
@@ -33,13 +53,14 @@ def write_once(path: Path, data: bytes) -> None:
 
 
 @contextmanager
-def _written_aside(path: Path, data: bytes) -> Iterator[Path]:
+def _written_aside(path: Path, data: bytes, *, synced: bool = True) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
     try:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            if synced:
+                os.fsync(file.fileno())
         yield temporary
     finally:
         temporary.unlink(missing_ok=True)

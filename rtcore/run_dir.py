@@ -162,7 +162,7 @@ class RunDir:
         for path in self.logs_dir.glob("*.stats"):
             try:
                 stats = msgspec.msgpack.decode(path.read_bytes(), type=Stats)
-            except (OSError, msgspec.DecodeError) as error:
+            except (OSError, ValueError, RecursionError) as error:
                 _LOGGER.warning("%s left out of the summary: %s", path.name, error)
                 continue
             found[stats.process, stats.incarnation] = stats
@@ -268,7 +268,7 @@ def _read_policy(path: Path) -> Policy | None:
         return msgspec.msgpack.decode(path.read_bytes(), type=Policy)
     except FileNotFoundError:
         return None
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         _LOGGER.warning("%s: %s", path, error)
         return None
 

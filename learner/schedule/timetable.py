@@ -7,8 +7,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import msgspec
+
 from learner.theory.optimum import HoldProblem, best_split
-from rtcore.config import BoundConfig, ConfigError, ScheduleConfig
+from rtcore.config import ConfigError, ScheduleConfig
 from rtcore.windows import FixedSchedule, Schedule, Window, make_schedule
 
 Choose = Callable[[ScheduleConfig, int], int]
@@ -105,16 +107,14 @@ class Timetable:
         """
         try:
             sections = [self._loaded(found) for found in json.loads(data)]
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ValueError(f"not a timetable: {error!r}") from error
         if not sections or sections[0].start != 0:
             raise ValueError("not a timetable: it must begin at unit 0")
         self._sections = sections
 
     def _loaded(self, found: dict[str, Any]) -> Section:
-        raw = dict(found["config"])
-        lists = {name: tuple(raw[name]) for name in ("t_m", "g_m")}
-        config = ScheduleConfig(**{**raw, **lists, "bound": BoundConfig(**raw["bound"])})
+        config = msgspec.convert(found["config"], ScheduleConfig)
         section = self._section(int(found["start"]), int(found["m"]), config)
         _chosen(section.schedule).update({int(m): int(update) for m, update in found["chosen"]})
         return section

@@ -1,4 +1,7 @@
-"""The learner service on a virtual clock, fed by hand over the in-memory bus."""
+"""The learner service on a virtual clock, fed by hand over the in-memory bus.
+
+A rig that is left without `learner.close()` is as good as killed: files are mapped, nothing waits in it.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from rtcore.ledger import Ledger
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Command, Policy, Spec, Step, StepBatch
 from rtcore.run_dir import RunDir
+from rtcore.tally import Tally
 
 TICK_NS, UNIT_NS = 100_000_000, 1_000_000_000  # ten ticks a unit
 SPEC = Spec(
@@ -58,7 +62,8 @@ class Rig:
     ) -> None:
         hub = MemoryHub()
         self.clock = clock or VirtualClock(0)
-        self.ledger = Ledger(channels.LEARNER, 1)
+        life = run_dir.next_incarnation(channels.LEARNER, 1)
+        self.ledger = Ledger(channels.LEARNER, life, Tally.create(run_dir.tally_path(channels.LEARNER, life)))
         env = hub.bus(channels.ENV_SERVER, self.clock)
         self.specs, self.log = env.publisher(channels.SPEC, "env0"), env.publisher(channels.LOG, "env0")
         self.learner = LearnerService(

@@ -52,9 +52,25 @@ def test_what_a_slow_learner_has_left_is_not_spent_in_a_hold_that_is_off() -> No
 
 def test_a_resumed_learner_does_not_wait_again() -> None:
     budget = UpdateBudget(LearnerConfig(utd=1.0, learning_starts=10))
-    budget.resume(7)
+    budget.resume(7, 0.0, 0)
     budget.earn(5, "update")
     assert spend_all(budget) == 2
+
+
+def test_what_is_not_in_the_checkpoint_is_spent_again() -> None:
+    """50 steps earned, 40 of them in the checkpoint, 8 more lost with the learner that made them."""
+    budget = UpdateBudget(LearnerConfig(utd=0.5, learning_starts=0))
+    budget.resume(100, 50.0, 40)
+    assert spend_all(budget) == 10
+    budget.earn(4, "update")
+    assert (budget.earned, budget.spent) == (52.0, 50)
+
+
+def test_a_checkpoint_that_knows_more_than_the_replay_leaves_no_debt() -> None:
+    budget = UpdateBudget(LearnerConfig(utd=1.0, learning_starts=0))
+    budget.resume(0, 40.0, 60)
+    budget.earn(3, "update")
+    assert spend_all(budget) == 3
 
 
 def test_a_table_goes_on_until_an_update_finds_nothing_new() -> None:

@@ -10,6 +10,7 @@ from learner import checkpoint
 from learner.algorithm import Algorithm, make_algorithm
 from learner.checkpoint import CheckpointError, State
 from rtcore.config import LearnerConfig, RunConfig
+from rtcore.files import write_atomic
 from rtcore.spaces import Spaces
 from rtcore.windows import Window
 from tests.learner.small import ACTION_DIM, OBSERVATION_DIM, filled_replay, forq, small_config
@@ -58,14 +59,13 @@ def test_a_save_cut_off_before_its_manifest_leaves_the_one_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint.save(tmp_path, state(1.0))
-    replace = checkpoint._replace
 
     def cut_off(path: Path, data: bytes) -> None:
         if path.name == checkpoint.MANIFEST:
             raise KeyboardInterrupt
-        replace(path, data)
+        write_atomic(path, data)
 
-    monkeypatch.setattr(checkpoint, "_replace", cut_off)
+    monkeypatch.setattr(checkpoint, "write_atomic", cut_off)
     with pytest.raises(KeyboardInterrupt):
         checkpoint.save(tmp_path, state(2.0))
     assert checkpoint.load(tmp_path).tensors["a"][0, 0] == 1.0
@@ -90,7 +90,7 @@ def test_another_schema_is_refused(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, state())
     path = tmp_path / checkpoint.MANIFEST
     path.write_text(json.dumps(json.loads(path.read_text()) | {"schema": 9}))
-    with pytest.raises(CheckpointError, match=r"schema 9 \(wanted 2\)"):
+    with pytest.raises(CheckpointError, match=r"schema 9 \(wanted 3\)"):
         checkpoint.load(tmp_path)
 
 

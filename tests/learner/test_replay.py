@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.replay import Batch, Replay, ReplayError, make_batch, open_replay
+from learner.replay import Batch, Replay, make_batch
 
 RNG = np.random.default_rng
 
@@ -108,42 +106,6 @@ def test_the_content_hash_is_of_what_is_held() -> None:
     assert wrapped.content_hash() != straight.content_hash()
 
 
-def test_a_replay_in_files_comes_back(tmp_path: Path) -> None:
-    replay = open_replay(tmp_path / "replay", 4, 2, 1)
-    for number in range(6):
-        add(replay, number, number)
-    replay.flush()
-    again = open_replay(tmp_path / "replay", 4, 2, 1)
-    assert again.content_hash() == replay.content_hash()
-    add(again, 6, 6)
-    assert set(drawn(again).reward) == {3, 4, 5, 6}
-
-
-def test_a_replay_that_was_never_flushed_starts_empty(tmp_path: Path) -> None:
-    add(open_replay(tmp_path, 4, 2, 1), 1, 1)
-    assert len(open_replay(tmp_path, 4, 2, 1)) == 0
-
-
-def test_a_replay_of_other_dimensions_is_refused(tmp_path: Path) -> None:
-    replay = open_replay(tmp_path, 4, 2, 1)
-    add(replay, 1, 1)
-    replay.flush()
-    with pytest.raises(ReplayError, match=r"capacity 4 \(wanted 8\), observation_dim 2 \(wanted 3\)$"):
-        open_replay(tmp_path, 8, 3, 1)
-
-
-def test_a_damaged_replay_is_refused(tmp_path: Path) -> None:
-    replay = open_replay(tmp_path, 4, 2, 1)
-    add(replay, 1, 1)
-    replay.flush()
-    (tmp_path / "reward.bin").unlink()
-    with pytest.raises(ReplayError, match=r"reward\.bin: missing"):
-        open_replay(tmp_path, 4, 2, 1)
-    (tmp_path / "cursor.json").write_text("{")
-    with pytest.raises(ReplayError, match="not readable"):
-        open_replay(tmp_path, 4, 2, 1)
-
-
 def test_transitions_are_read_by_number_across_the_rings_end() -> None:
     replay = Replay(4, 1, 1)
     for number in range(6):  # 0 and 1 are overwritten; the ring wraps between 3 and 4
@@ -155,14 +117,3 @@ def test_transitions_are_read_by_number_across_the_rings_end() -> None:
     assert replay.read(0, 3).reward.tolist() == [2.0, 3.0, 4.0]  # begins with the oldest held
     assert replay.read(6, 3).reward.tolist() == []
     assert replay.read(2, 9).unit.tolist() == [2, 3, 4, 5]
-
-
-def test_the_numbers_go_on_in_a_replay_that_was_there_before(tmp_path: Path) -> None:
-    value = np.zeros(1, np.float32)
-    replay = open_replay(tmp_path, 2, 1, 1)
-    for number in range(5):
-        replay.add(value, value, float(number), value, False, 0)
-    replay.flush()
-    again = open_replay(tmp_path, 2, 1, 1)
-    assert again.added == 5
-    assert again.read(3, 9).reward.tolist() == [3.0, 4.0]

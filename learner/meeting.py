@@ -1,0 +1,99 @@
+"""What a learner begins with, once it knows the world: everything that earlier ones of the run left."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass
+
+from learner import resume
+from learner.algorithm import Algorithm, make_algorithm
+from learner.marks import Record, peek
+from learner.place import Place
+from learner.replay import Replay, ReplayError, open_replay
+from learner.resume import Budget, Published
+from learner.store import MARKS
+from rtcore.clock import Clock
+from rtcore.config import RunConfig
+from rtcore.ledger import Ledger
+from rtcore.messages import Spec
+from rtcore.run_dir import RunDir
+from rtcore.spaces import Spaces
+
+LEARNER_STREAM = 2  # keeps the learner's random numbers apart from the world's and the agent's
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """A learner's replay and algorithm, and where it goes on.
+
+    Attributes:
+        replay: with all that was committed to it.
+        algorithm: over it, as of the newest checkpoint.
+        place: committed together with the replay.
+        counted: counters of the learners before.
+        published: policies so far.
+        settled: newest iterate that was due or published: (window, g).
+    """
+
+    replay: Replay
+    algorithm: Algorithm
+    place: Place
+    counted: Counter[str]
+    published: Published
+    settled: tuple[int, int]
+
+
+def meet(
+    config: RunConfig, run_dir: RunDir, spec: Spec, budget: Budget, clock: Clock, ledger: Ledger
+) -> Beginning:
+    """Take up what earlier learners of the run left; `budget` goes on by it as well.
+
+    Raises:
+        ConfigError: something does not fit, and `learner.on_mismatch` is "refuse".
+    """
+    learner, fresh = config.learner, config.learner.on_mismatch == "fresh"
+
+    def tell(text: str) -> None:
+        ledger.event(clock.now_ns(), "WARN", text)
+
+    def load() -> tuple[Replay, Place]:
+        found = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
+        return found, _place(found.committed)
+
+    directory = run_dir.learner_dir / resume.REPLAY_DIR
+    (replay, place), aside = resume.fitting(load, directory, fresh=fresh, tell=tell)
+    if aside is not None:  # what was learned from it is neither learned again nor lost
+        with suppress(ReplayError):
+            place = _place(peek(aside / MARKS))
+    seed = config.seed * 10 + LEARNER_STREAM
+    algorithm = make_algorithm(config, Spaces.of(spec), seed, replay)
+    directory = run_dir.learner_dir / resume.CHECKPOINT_DIR
+    restored, aside = resume.fitting(
+        lambda: resume.restore(run_dir, algorithm), directory, fresh=fresh, tell=tell
+    )
+    earned = place.course.earned
+    if aside is not None:
+        budget.resume(len(replay), earned, round(earned))  # an algorithm that starts anew has no arrears
+    elif restored is None:
+        budget.resume(len(replay), earned, 0)
+    else:  # a replay that starts anew has earned nothing yet
+        budget.resume(len(replay), max(earned, restored.earned), restored.spent)
+    counted, version = resume.ledgers(run_dir)
+    published = resume.published(run_dir, version)
+    if restored is not None or len(replay):
+        source = "no checkpoint" if restored is None else "the checkpoint"
+        text = f"goes on from {source}: policy {published.version}, {len(replay)} transitions in the replay"
+        ledger.event(clock.now_ns(), "INFO", text)
+    newest = published.policy
+    settled = place.course.settled
+    if newest is not None:  # it reaches the disk before anybody gets it
+        settled = max(settled, (newest.window, newest.iterate))
+    return Beginning(replay, algorithm, place, counted, published, settled)
+
+
+def _place(record: Record | None) -> Place:
+    try:
+        return Place.decode(b"" if record is None else record.note)
+    except ValueError as error:
+        raise ReplayError(f"the replay's place in the log is not readable: {error}") from error
