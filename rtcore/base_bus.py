@@ -26,7 +26,7 @@ class BaseBus(ABC):
     def latest(self, channel: Channel[MessageT], name: str = "") -> LatestReader[MessageT]:
         """A reader of the newest message; see `rtcore.bus.Bus.latest`."""
         self.check_open()
-        codec = Codec(channel, self._rejections)
+        codec = Codec(channel, self._rejections, name)
         inbox = LatestInbox(codec, self._bell(), self._clock.now_ns)
         retained = channel.delivery is Delivery.RETAINED
         key = key_for(channel, name, wildcard=True)
@@ -40,7 +40,7 @@ class BaseBus(ABC):
         self.check_open()
         if channel.delivery is not Delivery.REALTIME:
             raise ValueError(f"channel {channel.name} is {channel.delivery.value}: only realtime is attended")
-        codec = Codec(channel, self._rejections)
+        codec = Codec(channel, self._rejections, name)
         key = key_for(channel, name, wildcard=True)
         self._subscribe(key, codec, Attendant(codec, answer), channel.delivery)
 
@@ -49,10 +49,14 @@ class BaseBus(ABC):
     ) -> QueueReader[MessageT]:
         """A reader of every message; see `rtcore.bus.Bus.queue`."""
         self.check_open()
-        codec = Codec(channel, self._rejections)
+        codec = Codec(channel, self._rejections, name)
         inbox = QueueInbox(codec, capacity, self._bell(), self._clock.now_ns)
         self._subscribe(key_for(channel, name, wildcard=True), codec, inbox, channel.delivery)
         return inbox
+
+    def reject(self, channel: Channel[MessageT], reason: object) -> None:
+        """Count a message that its reader refuses; see `rtcore.bus.Bus.reject`."""
+        self._rejections.count(channel.name, reason)
 
     def rejected(self) -> dict[str, int]:
         """Messages refused so far, per channel name."""

@@ -71,7 +71,7 @@ class Bus(Protocol):
     """One process's connection to all the others. Usable from any thread.
 
     A process also hears itself: its own readers get what it publishes. After `close`, `put` and every
-    method but `rejected` and `close` raise BusClosedError; readers give what they still hold.
+    method but `reject`, `rejected` and `close` raise BusClosedError; readers give what they still hold.
     """
 
     def publisher(self, channel: Channel[MessageT], name: str = "") -> Publisher[MessageT]:
@@ -114,6 +114,9 @@ class Bus(Protocol):
 
     def alive(self) -> frozenset[str]:
         """Names of the processes that are connected now (this one included, once declared)."""
+
+    def reject(self, channel: Channel[MessageT], reason: object) -> None:
+        """Count a message that its reader refuses though it is valid by itself; logged at a limited rate."""
 
     def rejected(self) -> dict[str, int]:
         """Messages refused so far, per channel name."""

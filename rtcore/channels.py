@@ -8,9 +8,10 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
-from rtcore import messages
+from rtcore import admission, messages
 
 MessageT = TypeVar("MessageT", bound=messages.Message)
 
@@ -68,17 +69,30 @@ class Channel(Generic[MessageT]):
 
 _ENV, _ALL = (ENV_SERVER,), (*PROCESSES, LAUNCHER)
 
-SPEC = Channel("spec", "env/{name}/spec", messages.Spec, Delivery.RETAINED, 0, None, 65_536, True, _ENV)
+SPEC = Channel(
+    "spec", "env/{name}/spec", messages.Spec, Delivery.RETAINED, 0, None, 65_536, True, _ENV,
+    admission.check_spec,
+)  # fmt: skip
 STEP = Channel("step", "env/{name}/step", messages.Step, Delivery.REALTIME, None, 2.0, 30_000, False, _ENV)
-LOG = Channel("log", "env/{name}/log", messages.StepBatch, Delivery.LOSSLESS, 20, 2.0, 4 << 20, True, _ENV)
+LOG = Channel(
+    "log", "env/{name}/log", messages.StepBatch, Delivery.LOSSLESS, 20, 2.0, 4 << 20, True, _ENV,
+    admission.check_batch,
+)  # fmt: skip
 ACTION = Channel(
     "action", "env/{name}/action", messages.Action, Delivery.REALTIME, None, 2.0, 30_000, False, (AGENT,)
 )
-POLICY = Channel("policy", "policy", messages.Policy, Delivery.RETAINED, 0, None, 32 << 20, True, (LEARNER,))
+POLICY = Channel(
+    "policy", "policy", messages.Policy, Delivery.RETAINED, 0, None, 32 << 20, True, (LEARNER,),
+    admission.check_policy,
+)  # fmt: skip
 WINDOW = Channel(
-    "window", "window", messages.WindowNotice, Delivery.RETAINED, 0, None, 65_536, True, (LEARNER,)
-)
-STATS = Channel("stats", "stats/{name}", messages.Stats, Delivery.TELEMETRY, 4, 2.0, 1 << 20, True, _ALL)
+    "window", "window", messages.WindowNotice, Delivery.RETAINED, 0, None, 65_536, True, (LEARNER,),
+    admission.check_notice,
+)  # fmt: skip
+STATS = Channel(
+    "stats", "stats/{name}", messages.Stats, Delivery.TELEMETRY, 4, 2.0, 1 << 20, True, _ALL,
+    partial(admission.check_stats, speakers=_ALL),
+)  # fmt: skip
 
 TABLE = (SPEC, STEP, LOG, ACTION, POLICY, WINDOW, STATS)
 

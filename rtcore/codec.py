@@ -14,16 +14,27 @@ import threading
 import zlib
 from collections import Counter
 from collections.abc import Callable
-from typing import Generic
+from operator import attrgetter
+from typing import Any, Generic
 
 import msgspec
 
 from rtcore.channels import Channel, MessageT
 from rtcore.lifecycle import RateLimited
+from rtcore.messages import Action, Message, Spec, Stats, Step, StepBatch
 
 LOG_PERIOD_S = 10.0  # a flood of bad messages writes one line per channel and period
 
 CRC_BYTES = 4
+
+# Whom a message says it is of, where its key says so too; None: it names nobody.
+_NAMED: dict[type[Message], Callable[[Any], str | None]] = {
+    Spec: attrgetter("env"),
+    Step: attrgetter("env"),
+    StepBatch: lambda batch: batch.steps[0].env if batch.steps else None,  # all of one: `check_batch`
+    Action: attrgetter("env"),
+    Stats: attrgetter("process"),
+}
 
 _FORBIDDEN_IN_NAME = frozenset("/*$#?@")  # they mean something in a key
 
@@ -51,6 +62,12 @@ def check_name(name: str) -> None:
     """Raise ValueError unless `name` can stand in a key."""
     if not name or _FORBIDDEN_IN_NAME.intersection(name):
         raise ValueError(f"name = {name!r}: must be non-empty and without any of / * $ # ? @")
+
+
+def name_in(key: str) -> str:
+    """The environment or process that a key below the run's namespace is of; empty if it is of none."""
+    parts = key.split("/")
+    return parts[1] if len(parts) > 1 else ""
 
 
 class Rejections:
@@ -86,9 +103,12 @@ def seal(encoded: bytes) -> bytes:
 class Codec(Generic[MessageT]):
     """Encodes and decodes one channel's messages within its limits. Usable from any thread."""
 
-    def __init__(self, channel: Channel[MessageT], rejections: Rejections) -> None:
+    def __init__(self, channel: Channel[MessageT], rejections: Rejections, name: str = "") -> None:
+        """`name`: the environment or process whose key is read; empty or `*`: `decode` is told, or none."""
         self._channel = channel
         self._rejections = rejections
+        self._name = "" if name == "*" else name
+        self._named = _NAMED.get(channel.type, _nobody)
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode = msgspec.msgpack.Decoder(channel.type).decode
 
@@ -127,15 +147,26 @@ class Codec(Generic[MessageT]):
         self._rejections.count(self._channel.name, f"{len(payload)} bytes with a wrong checksum")
         return False
 
-    def decode(self, payload: bytes) -> MessageT | None:
-        """The message, or None, and one more on the count: the bytes are not a valid one, or the channel's
-        check refuses it."""
+    def decode(self, payload: bytes, name: str = "") -> MessageT | None:
+        """The message, or None, and one more on the count: the bytes are not a valid one, the channel's check
+        refuses it, or it names another than the key that it came on, which is that of `name`."""
         if not self.intact(payload):
             return None
         try:
             message = self._decode(memoryview(payload)[:-CRC_BYTES])
+            if name or self._name:
+                self._compare(self._named(message), name or self._name)
             self._channel.check(message)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             self._rejections.count(self._channel.name, error)
             return None
         return message
+
+    @staticmethod
+    def _compare(said: str | None, name: str) -> None:
+        if said is not None and said != name:
+            raise ValueError(f"says that it is of {said[:80]!r} on the key of {name!r}")
+
+
+def _nobody(_message: object) -> None:
+    """A message that names nobody."""

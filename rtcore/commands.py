@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import msgspec
 
+from rtcore.admission import check_command
 from rtcore.bus import NoAnswerError
 from rtcore.codec import Rejections
 from rtcore.messages import Command, CommandReply
@@ -35,7 +36,7 @@ class CommandServer:
 
     def answer(self, payload: bytes) -> bytes | None:
         """The encoded reply; None (and one more on the count) if the payload is not a command."""
-        command = _decode(self._decoder, payload, self._rejections)
+        command = _decode(self._decoder, payload, self._rejections, check_command)
         if command is None:
             return None
         with self._lock:  # a repeat waits for the first reply
@@ -81,12 +82,23 @@ class CommandClient:
         )
 
 
-def _decode(decoder: msgspec.msgpack.Decoder[_T], payload: bytes, rejections: Rejections) -> _T | None:
+def _accept(_message: object) -> None:
+    """Every reply that decodes."""
+
+
+def _decode(
+    decoder: msgspec.msgpack.Decoder[_T],
+    payload: bytes,
+    rejections: Rejections,
+    check: Callable[[_T], None] = _accept,
+) -> _T | None:
     if len(payload) > MAX_BYTES:
         rejections.count(CONTROL, f"{len(payload)} bytes: at most {MAX_BYTES} allowed")
         return None
     try:
-        return decoder.decode(payload)
+        message = decoder.decode(payload)
+        check(message)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         rejections.count(CONTROL, error)
         return None
+    return message

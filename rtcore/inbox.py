@@ -49,8 +49,9 @@ class ThreadBell:
 class Inbox(Protocol):
     """Takes what a bus receives."""
 
-    def offer(self, payload: bytes, received_ns: int) -> None:
-        """Keep the bytes that arrived at `received_ns`. From any thread; never waits."""
+    def offer(self, payload: bytes, received_ns: int, name: str = "") -> None:
+        """Keep the bytes that arrived at `received_ns`. From any thread; never waits. `name`: the one in the
+        key, where the reader reads several."""
 
 
 class LatestInbox(Generic[MessageT]):
@@ -60,20 +61,20 @@ class LatestInbox(Generic[MessageT]):
         self._codec = codec
         self._bell = bell
         self._now_ns = now_ns
-        self._slot: deque[tuple[bytes, int]] = deque(maxlen=1)  # append and pop are atomic
+        self._slot: deque[tuple[bytes, int, str]] = deque(maxlen=1)  # append and pop are atomic
 
-    def offer(self, payload: bytes, received_ns: int) -> None:
+    def offer(self, payload: bytes, received_ns: int, name: str = "") -> None:
         """Replace what is there."""
-        self._slot.append((payload, received_ns))
+        self._slot.append((payload, received_ns, name))
         self._bell.ring()
 
     def take(self) -> Received[MessageT] | None:
         """The newest message if it was not taken before and is valid, else None."""
         try:
-            payload, received_ns = self._slot.pop()
+            payload, received_ns, name = self._slot.pop()
         except IndexError:
             return None
-        message = self._codec.decode(payload)
+        message = self._codec.decode(payload, name)
         return None if message is None else Received(message, received_ns)
 
     def wait(self, timeout_s: float) -> Received[MessageT] | None:
@@ -94,9 +95,9 @@ class Attendant(Generic[MessageT]):
         self._codec = codec
         self._answer = answer
 
-    def offer(self, payload: bytes, received_ns: int) -> None:
+    def offer(self, payload: bytes, received_ns: int, name: str = "") -> None:
         """Decode and answer."""
-        message = self._codec.decode(payload)
+        message = self._codec.decode(payload, name)
         if message is not None:
             self._answer(Received(message, received_ns))
 
@@ -111,7 +112,7 @@ class QueueInbox(Generic[MessageT]):
         self._bell = bell
         self._now_ns = now_ns
         self._lock = threading.Lock()  # between receiving threads, so that the count is exact
-        self._items: deque[tuple[bytes, int]] = deque(maxlen=capacity)
+        self._items: deque[tuple[bytes, int, str]] = deque(maxlen=capacity)
         self._dropped = 0
 
     @property
@@ -119,11 +120,11 @@ class QueueInbox(Generic[MessageT]):
         """Messages lost because the queue was full."""
         return self._dropped
 
-    def offer(self, payload: bytes, received_ns: int) -> None:
+    def offer(self, payload: bytes, received_ns: int, name: str = "") -> None:
         """Append; a full queue loses its oldest."""
         with self._lock:
             self._dropped += len(self._items) == self._items.maxlen
-            self._items.append((payload, received_ns))
+            self._items.append((payload, received_ns, name))
         self._bell.ring()
 
     def drain(self) -> list[Received[MessageT]]:
@@ -132,8 +133,8 @@ class QueueInbox(Generic[MessageT]):
             items = list(self._items)
             self._items.clear()
         drained = []
-        for payload, received_ns in items:
-            message = self._codec.decode(payload)
+        for payload, received_ns, name in items:
+            message = self._codec.decode(payload, name)
             if message is not None:
                 drained.append(Received(message, received_ns))
         return drained

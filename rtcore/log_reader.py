@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from rtcore import channels
+from rtcore.admission import check_same_world
 from rtcore.bus import Bus
-from rtcore.messages import Step
+from rtcore.epoch import this_boot
+from rtcore.messages import Spec, Step, StepBatch
 from rtcore.stream import StepStream
 
 PATIENCE_NS = 5_000_000_000  # a missing step is waited for so long; the bus recovers one within 2 s
+MAX_DECLARED = 256  # incarnations remembered, the newest
+MAX_UNDECLARED = 256  # batches that wait for a declaration: 13 s of a log
+# A tick is over only after its deadline, by the clock of the host that declared it. Without a host, as in
+# virtual time, roughly so; another host's clock says nothing here.
+SLACK_TICKS = 1_000
 
 
 class LogReader:
     """One reader's place in the log of one environment.
+
+    A batch is taken from an incarnation that has declared itself; one that comes before its declaration waits
+    for it. What nobody declares, or what lies in the future, is refused and counted on the log's channel: as
+    a newer incarnation, or a later step, it would end the true one, or make it late.
 
     Attributes:
         stream: its counters tell what came, came twice, and never came.
     """
 
     def __init__(self, bus: Bus, env: str, *, capacity_batches: int) -> None:
+        self._bus = bus
+        self._specs = bus.queue(channels.SPEC, env, capacity=MAX_DECLARED)
         self._batches = bus.queue(channels.LOG, env, capacity=capacity_batches)
+        self._capacity = capacity_batches
+        self._declared: dict[int, Spec] = {}
+        self._undeclared: deque[tuple[int, StepBatch]] = deque()  # with the instant at which it was read
         self._waiting_since_ns: int | None = None  # a step is missing since then
+        self._boot = ""
         self.stream = StepStream()
 
     def go_on_from(self, position: tuple[int, int] | None) -> None:
@@ -38,8 +57,12 @@ class LogReader:
     def read(self, now_ns: int) -> list[Step]:
         """New steps; those behind a missing one come when it does, or 5 s later without it."""
         steps: list[Step] = []
-        for received in self._batches.drain():
-            steps += self.stream.feed(received.message)
+        # First the batches: what they hold was declared before.
+        batches = [received.message for received in self._batches.drain()]
+        for declared in self._specs.drain():
+            self._declare(declared.message)
+        for batch in self._admitted(batches, now_ns):
+            steps += self.stream.feed(batch)
         if not self.stream.waiting:
             self._waiting_since_ns = None
         elif self._waiting_since_ns is None or steps:
@@ -51,4 +74,53 @@ class LogReader:
 
     def finish(self) -> list[Step]:
         """Nothing follows: give up on what is missing, and return what waited behind it."""
+        for _ in self._undeclared:
+            self._refuse("an env server that never declared itself")
+        self._undeclared.clear()
         return self.stream.flush()
+
+    def _declare(self, spec: Spec) -> None:
+        try:
+            if self._declared:
+                check_same_world(spec, next(iter(self._declared.values())))
+        except ValueError as error:
+            self._bus.reject(channels.SPEC, error)
+            return
+        self._boot = self._boot or this_boot()
+        self._declared[spec.incarnation] = spec
+        if len(self._declared) > MAX_DECLARED:  # the first one stays: it tells what the world is
+            del self._declared[min(list(self._declared)[1:])]
+
+    def _admitted(self, batches: list[StepBatch], now_ns: int) -> list[StepBatch]:
+        """What may be taken now, oldest first."""
+        waiting, self._undeclared = self._undeclared, deque()
+        admitted: list[StepBatch] = []
+        for since_ns, batch in [*waiting, *((now_ns, batch) for batch in batches)]:
+            spec = self._declared.get(batch.steps[0].incarnation) if batch.steps else None
+            if spec is None and batch.steps:
+                self._defer(since_ns, batch, now_ns)
+            elif spec is not None and batch.steps[-1].tick > self._newest_tick(spec, now_ns):
+                self._refuse(f"tick {batch.steps[-1].tick} of the future")
+            else:
+                admitted.append(batch)
+        return admitted
+
+    def _defer(self, since_ns: int, batch: StepBatch, now_ns: int) -> None:
+        """Let a batch wait for its declaration, as long as a missing step; without any, as in a queue."""
+        if self._declared and now_ns - since_ns >= PATIENCE_NS:
+            self._refuse("an env server that did not declare itself")
+            return
+        self._undeclared.append((since_ns, batch))
+        if len(self._undeclared) > (MAX_UNDECLARED if self._declared else self._capacity):
+            self._undeclared.popleft()
+            self._refuse("too many batches of env servers that did not declare themselves")
+
+    def _newest_tick(self, spec: Spec, now_ns: int) -> int:
+        """The last tick that can be over by now."""
+        if spec.host not in ("", self._boot):
+            return 1 << 62
+        slack = 0 if spec.host else SLACK_TICKS
+        return max(0, now_ns - spec.t0_ns) // spec.tick_ns + slack
+
+    def _refuse(self, why: str) -> None:
+        self._bus.reject(channels.LOG, why)

@@ -16,7 +16,7 @@ from rtcore.base_bus import BaseBus
 from rtcore.bus import Publisher
 from rtcore.channels import Channel, Delivery, MessageT
 from rtcore.clock import Clock, VirtualClock
-from rtcore.codec import Codec, check_name, key_for
+from rtcore.codec import Codec, check_name, key_for, name_in
 from rtcore.commands import CommandClient, CommandServer
 from rtcore.inbox import Bell, Inbox, ThreadBell
 from rtcore.messages import Command, CommandReply
@@ -42,11 +42,11 @@ class VirtualBell:
 
 @dataclass(frozen=True, eq=False)
 class _Subscription:
-    """One reader's key and how it takes bytes."""
+    """One reader's key and how it takes bytes and the key they came on."""
 
     bus: MemoryBus
     key: str
-    receive: Callable[[bytes], None]
+    receive: Callable[[bytes, str], None]
 
     def matches(self, key: str) -> bool:
         """Whether `key` is meant; `*` stands for one chunk."""
@@ -81,7 +81,7 @@ class _Exchange:
             if route is None:
                 route = self._routes[key] = tuple(s for s in self._subscriptions if s.matches(key))
             for subscription in route:
-                subscription.receive(payload)
+                subscription.receive(payload, key)
 
     def publish(self, journal: _Journal, payload: bytes) -> None:
         with self._lock:
@@ -97,8 +97,9 @@ class _Exchange:
         with self._lock:
             if history:
                 journals = [journal for journal in self._journals if subscription.matches(journal.key)]
-                for _, payload in sorted(entry for journal in journals for entry in journal.kept):
-                    subscription.receive(payload)
+                kept = sorted((*entry, journal.key) for journal in journals for entry in journal.kept)
+                for _, payload, key in kept:
+                    subscription.receive(payload, key)
             self._subscriptions.append(subscription)
             self._routes.clear()
 
@@ -214,8 +215,10 @@ class MemoryBus(BaseBus):
         return VirtualBell(self._clock) if isinstance(self._clock, VirtualClock) else ThreadBell()
 
     def _subscribe(self, key: str, codec: Codec[MessageT], inbox: Inbox, delivery: Delivery) -> None:
-        def receive(payload: bytes) -> None:
+        wild = "*" in key
+
+        def receive(payload: bytes, put_on: str) -> None:
             if codec.fits(len(payload)):
-                inbox.offer(payload, self._clock.now_ns())
+                inbox.offer(payload, self._clock.now_ns(), name_in(put_on) if wild else "")
 
         self._exchange.subscribe(_Subscription(self, key, receive), history=KEPT[delivery] > 0)

@@ -13,9 +13,10 @@ import msgspec
 
 from rtcore.config import ScheduleConfig
 
-Count = Annotated[int, msgspec.Meta(ge=0)]
-Nanos = Annotated[int, msgspec.Meta(ge=0)]
-Index = Annotated[int, msgspec.Meta(ge=-1)]  # -1 means "none"
+MOST = 1 << 62  # of any number on the wire: sums and differences of two stay within 64 bits
+Count = Annotated[int, msgspec.Meta(ge=0, le=MOST)]
+Nanos = Annotated[int, msgspec.Meta(ge=0, le=MOST)]  # 146 years
+Index = Annotated[int, msgspec.Meta(ge=-1, le=MOST)]  # -1 means "none"
 
 MissCause = Literal[
     "",
@@ -49,8 +50,8 @@ class Spec(Message, frozen=True, kw_only=True):
     incarnation: Nanos  # of the env server: greater after every restart
     t0_ns: int  # deadline of tick 0; below 0 if the host was started anew since
     wall_t0_ns: Nanos  # Unix time at t0_ns, for the `wall` timeline alone
-    tick_ns: Annotated[int, msgspec.Meta(gt=0)]
-    unit_ns: Annotated[int, msgspec.Meta(gt=0)]
+    tick_ns: Annotated[int, msgspec.Meta(gt=0, le=MOST)]
+    unit_ns: Annotated[int, msgspec.Meta(gt=0, le=MOST)]
     observation_dim: Annotated[int, msgspec.Meta(gt=0)]  # with what `notify` tells and observed actions
     action_dim: Annotated[int, msgspec.Meta(gt=0)]
     action_low: list[float]
@@ -149,7 +150,7 @@ class Architecture(Message, frozen=True, kw_only=True):
 class Policy(Message, frozen=True, kw_only=True):
     """One published iterate pi^g of window m."""
 
-    version: Annotated[int, msgspec.Meta(gt=0)]  # rises by one, across restarts
+    version: Annotated[int, msgspec.Meta(gt=0, le=MOST)]  # rises by one, across restarts
     window: Count
     iterate: Count
     algo: str

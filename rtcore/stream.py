@@ -34,7 +34,8 @@ class StepStream:
         late: steps that came after they had been given up, or after their incarnation.
         gaps: steps given up, so lost to the reader. What an incarnation that ended did after its last
             step seen here is not in it: nobody here knows of it.
-        ended: the env server ended in order, and nothing before its end is missing.
+        ended: the env server ended in order, and nothing before its end is missing. An end that steps of its
+            incarnation follow was none.
 
     Args:
         position: (incarnation, seq) of the next step to hand out, where a restarted reader goes on;
@@ -47,7 +48,7 @@ class StepStream:
         self._waiting: dict[int, Step] = {}
         self._lost: list[range] = []  # of this incarnation, to tell late from duplicate
         self._max_waiting = max_waiting
-        self._last = False
+        self._end: int | None = None  # of this incarnation: the seq after its last
         self.received = 0
         self.delivered = 0
         self.duplicate = 0
@@ -67,7 +68,7 @@ class StepStream:
     @property
     def ended(self) -> bool:
         """See the class."""
-        return self._last and not self._waiting
+        return self._end is not None and not self._waiting
 
     def feed(self, batch: StepBatch) -> list[Step]:
         """Take a batch; return the steps that are due now, oldest first."""
@@ -82,7 +83,7 @@ class StepStream:
             due += self.give_up()
         # An empty batch names no incarnation: it can only end the present one.
         if batch.last and all(step.incarnation == self._incarnation for step in batch.steps):
-            self._last = True
+            self._end = max([self._next, *(seq + 1 for seq in self._waiting)])
         return due
 
     def give_up(self) -> list[Step]:
@@ -104,7 +105,7 @@ class StepStream:
 
     def _begin(self, incarnation: int) -> list[Step]:
         rest = self._release() + self.flush()
-        self._incarnation, self._next, self._last = incarnation, 0, False
+        self._incarnation, self._next, self._end = incarnation, 0, None
         self._lost.clear()
         return rest
 
@@ -119,6 +120,8 @@ class StepStream:
             self.duplicate += 1
         else:
             self._waiting[step.seq] = step
+            if self._end is not None and step.seq >= self._end:
+                self._end = None
 
     def _release(self) -> list[Step]:
         due = []

@@ -71,7 +71,8 @@ DEEDS = {deed.__name__: deed for deed in (publish, read, answer, leave, fail)}
 def main() -> None:
     deed, role, socket_dir = sys.argv[1:4]
     incarnation = int(sys.argv[4]) if len(sys.argv) > 4 else 1
-    with open_bus(role, ZenohWorld.RUN, Path(socket_dir), clock=MonotonicClock()) as bus:
+    secure = sys.argv[5] if len(sys.argv) > 5 else ""
+    with open_bus(role, ZenohWorld.RUN, Path(socket_dir), clock=MonotonicClock(), secure=secure) as bus:
         bus.declare_alive(role)
         DEEDS[deed](bus, incarnation)
 

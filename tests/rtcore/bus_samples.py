@@ -7,9 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
+import msgspec
+
 from rtcore import channels
 from rtcore.bus import Bus, QueueReader
 from rtcore.channels import Channel
+from rtcore.histogram import Histogram
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import (
     Action,
@@ -145,8 +148,8 @@ def step(seq: int, incarnation: int = 1, observation: bytes = b"\0" * 68) -> Ste
     )
 
 
-def batch(seq: int, incarnation: int = 1) -> StepBatch:
-    return StepBatch(steps=[step(seq, incarnation)])
+def batch(seq: int, incarnation: int = 1, env: str = ENV) -> StepBatch:
+    return StepBatch(steps=[msgspec.structs.replace(step(seq, incarnation), env=env)])
 
 
 def policy(version: int, weights: bytes = b"weights") -> Policy:
@@ -172,7 +175,7 @@ def stats(process: str, seq: int = 0) -> Stats:
         final=False,
         counters={"ticks": 3},
         gauges={"alpha": 0.5},
-        histograms={"loop": b"h"},
+        histograms={"loop": Histogram().to_bytes()},
         events=[Event(at_ns=1, level="WARN", text="late")],
         returns=[EpisodeReturn(episode=1, at_ns=2, value=3.5, length=4)],
     )

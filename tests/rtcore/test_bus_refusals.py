@@ -10,15 +10,17 @@ import msgspec
 import pytest
 
 from rtcore import channels
-from rtcore.channels import ACTION, AGENT, ENV_SERVER, STEP
+from rtcore.channels import ACTION, AGENT, ENV_SERVER, LOG, STATS, STEP
 from rtcore.codec import seal
 from rtcore.messages import Action
 from tests.rtcore.bus_samples import (
     ENV,
     World,
     action,
+    batch,
     eventually,
     meet,
+    stats,
     step,
 )
 
@@ -120,3 +122,28 @@ def test_what_the_channels_check_refuses_is_rejected_like_what_does_not_decode(w
     assert got == [3]
     assert env.rejected() == {"action": 1}
     assert agent.rejected() == {}
+
+
+@pytest.mark.parametrize("name", ["learner", "*"])
+def test_a_message_in_another_ones_name_is_rejected(world: World, name: str) -> None:
+    reader = world.bus(ENV_SERVER)
+    queue = reader.queue(STATS, name)
+    world.inject(STATS.key_for("learner"), seal(msgspec.msgpack.encode(stats("env_server"))))
+    assert queue.wait(5.0)
+    assert queue.drain() == []
+    assert reader.rejected() == {"stats": 1}
+
+
+def test_a_step_of_another_env_is_rejected(world: World) -> None:
+    agent = world.bus(AGENT)
+    queue = agent.queue(LOG, ENV)
+    world.inject(LOG.key_for(ENV), seal(msgspec.msgpack.encode(batch(0, env="env1"))))
+    assert queue.wait(5.0)
+    assert queue.drain() == []
+    assert agent.rejected() == {"log": 1}
+
+
+def test_a_reader_may_refuse_what_is_valid_by_itself(world: World) -> None:
+    agent = world.bus(AGENT)
+    agent.reject(STEP, "of the future")
+    assert agent.rejected() == {"step": 1}

@@ -50,7 +50,7 @@ def test_late_history_keeps_the_order_of_all_publishers() -> None:
     bus = hub.bus("env", clock)
     first, second = bus.publisher(LOG, "a"), bus.publisher(LOG, "b")
     for seq, publisher in enumerate((first, second, second, first)):
-        publisher.put(batch(seq))
+        publisher.put(batch(seq, env="a" if publisher is first else "b"))
     drained = hub.bus("recorder", clock).queue(LOG, "*").drain()
     assert [received.message.steps[0].seq for received in drained] == [0, 1, 2, 3]
 
@@ -74,7 +74,7 @@ def test_many_threads_lose_nothing_uncounted() -> None:
         for seq in range(200):
             publisher.put(stats(process, seq))
 
-    threads = [threading.Thread(target=send, args=(f"p{number}",)) for number in range(4)]
+    threads = [threading.Thread(target=send, args=(name,)) for name in channels.PROCESSES]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -149,6 +149,16 @@ def test_the_end_is_known_once_nothing_is_missing() -> None:
     assert ended == [False, False, True, False, False, True]
 
 
+def test_an_end_that_steps_follow_was_none() -> None:
+    stream = StepStream()
+    stream.feed(batch(0, 1))
+    ended = []
+    for fed in (StepBatch(steps=[], last=True), batch(2), batch(4, last=True), batch(3), batch(5)):
+        stream.feed(fed)
+        ended.append(stream.ended)
+    assert ended == [True, False, False, True, False]  # step 3 comes before the end that 4 said
+
+
 def tuples(steps: list[Step]) -> list[tuple[object, ...]]:
     """The transitions in a list of steps, comparable."""
     transitions = Transitions(2, 1)
