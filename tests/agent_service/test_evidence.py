@@ -8,7 +8,7 @@ import os
 import threading
 import time
 
-from agent_service.evidence import Evidence, Excuse, Stopwatch
+from agent_service.evidence import RECENT_NS, Evidence, Excuse, Stopwatch
 from rtcore.clock import VirtualClock
 
 
@@ -83,22 +83,26 @@ def test_a_wait_for_a_core_is_an_excuse_of_the_thread_that_waited() -> None:
     starved_ns: list[int] = []
 
     def act() -> None:
-        evidence.excuse(1)
         together = threading.Barrier(4)
         rivals = [threading.Thread(target=burn, args=(core, 20_000_000, together)) for _ in range(3)]
         for rival in rivals:
             rival.start()
+        evidence.excuse(1)
+        began_ns = time.monotonic_ns()
         burn(core, 8_000_000, together)
-        starved_ns.append(evidence.excuse(1).starved_ns)
-        starved_ns.append(evidence.excuse(1).starved_ns)
+        waits = [evidence.excuse(1).starved_ns, evidence.excuse(1).starved_ns]
+        if time.monotonic_ns() - began_ns < RECENT_NS:
+            starved_ns.extend(waits)
         for rival in rivals:
             rival.join()
 
     with evidence.gathered():
-        acting = threading.Thread(target=act)
-        acting.start()
-        acting.join()
-    # four threads share the core: 8 ms of work take 32, and 24 of these are waiting; 60 if the others come
-    # first, which is still less than the 100 ms beyond which a wait is nobody's excuse
+        for _ in range(50):  # on a core that others load as well, a wait may be too long to be an excuse
+            acting = threading.Thread(target=act)
+            acting.start()
+            acting.join()
+            if starved_ns:
+                break
+    # four threads share the core: 8 ms of work take 32, and 24 of these are waiting
     assert starved_ns[0] > 5_000_000
     assert starved_ns[1] < starved_ns[0] / 2
