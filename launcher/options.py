@@ -6,7 +6,7 @@ second reading.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -30,6 +30,8 @@ from rtcore.config import (
 from rtcore.config_check import check
 from rtcore.config_io import load_toml
 from rtcore.run_dir import RunDir
+from rtcore.signing import identity
+from rtcore.zenoh_config import require_tls
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +68,8 @@ class ProcessOptions(RunOptions):
     """A further endpoint to connect to; may be given several times."""
     listen: Annotated[tuple[str, ...], UseAppendAction] = ()
     """A further endpoint to listen on; may be given several times."""
+    router: str = ""
+    """The Zenoh router, like tcp/host:7447, to reach the others through, and nothing else."""
 
 
 SHORT = {"--learner.schedule": "--learner.schedule.kind"}  # what a section is mostly asked for by
@@ -115,6 +119,18 @@ def _resolved(config: RunConfig) -> RunConfig:
     if config.learner.algo == "rsac":
         worlds.require_speed(resolved.env, config.learner.reward)
     return resolved
+
+
+def require_keys(link: LinkConfig, roles: Iterable[str], endpoints: Sequence[str] = ()) -> None:
+    """Where links are secured, see that they can be, before anything is made.
+
+    Raises:
+        ConfigError: a certificate or an endpoint does not do.
+    """
+    if link.secure:
+        for role in roles:
+            identity(link.secure, role)
+        require_tls((*link.connect, *link.listen, *endpoints))
 
 
 def _absolute(path: str) -> str:

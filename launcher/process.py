@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from launcher import options
+from launcher.starting import process_command
 from rtcore import channels
 from rtcore.config import ConfigError, RunConfig
 from rtcore.run_dir import RunDir
@@ -48,11 +49,11 @@ def _become(process: str, command: str, does: str, argv: Sequence[str]) -> NoRet
     )
     if chosen.run_dir is None:
         raise ConfigError("run_dir", None, "must be given: the directory that the run's processes share")
+    options.require_keys(config.link, [process], (*chosen.connect, *chosen.listen))
     run_dir = _join(chosen.run_dir, config)
-    arguments = [sys.executable, "-m", process, "--run", str(run_dir.path)]
-    for name, endpoints in (("--connect", chosen.connect), ("--listen", chosen.listen)):
-        for endpoint in endpoints:
-            arguments += [name, endpoint]
+    arguments = process_command(
+        process, run_dir.path, connect=chosen.connect, listen=chosen.listen, router=chosen.router
+    )
     sys.stdout.flush()
     os.execv(sys.executable, arguments)
 

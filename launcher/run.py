@@ -12,18 +12,25 @@ from pathlib import Path
 
 from rich.console import Console
 
-from launcher import options, report
+from launcher import options, regret, report
 from launcher.cli import DONE, FAILED, INTERRUPTED, CommandError
+from launcher.herald import logged
+from launcher.lookout import Lookout
+from launcher.mending import mend
+from launcher.restarts import Happening, Restarts
 from launcher.screen import Screen
-from launcher.summary import Summary, summarise
+from launcher.summary import PASSED, Summary, summarise
 from launcher.supervisor import End, Interrupts, Supervisor, command_for
 from launcher.viewer import Viewer
+from launcher.vitals import Vitals
 from launcher.watch import Watch
-from rtcore import channels, realtime
-from rtcore.bus import Bus, BusError
-from rtcore.config import RunConfig
+from rtcore import channels, epoch, realtime
+from rtcore.bus import BusError
+from rtcore.config import ConfigError, RunConfig
+from rtcore.files import write_atomic
 from rtcore.monotonic import MonotonicClock
-from rtcore.run_dir import RunDir, default_run_path, write_atomic
+from rtcore.run_dir import RunDir, default_run_path
+from rtcore.signing import OPERATOR
 from rtcore.zenoh_bus import open_bus
 
 RUNS = Path("runs")
@@ -34,6 +41,7 @@ def run(argv: Sequence[str]) -> int:
     """`tenuto run [PRESET] ...`."""
     description = options.describe("Learn in real time, with all processes on this machine.")
     config, chosen = options.read(options.RunOptions, argv, prog="tenuto run", description=description)
+    options.require_keys(config.link, (*_wanted(config), OPERATOR))
     run_dir = RunDir.create(chosen.run_dir or default_path(config), config)
     clock, console = MonotonicClock(), Console()
     console.print(f"run  {run_dir.path}", highlight=False, soft_wrap=True)
@@ -56,10 +64,12 @@ def run(argv: Sequence[str]) -> int:
         run_dir.run_name,
         watch.stats(),
         wall_s=wall_s,
-        restarts={},
+        restarts=watch.restarts,
         ended=_why(end, config, watch),
         forced=end.forced,
     )
+    summary["supervision"] = _told(watch.happenings, run_dir, began_ns)
+    summary |= regret.of_run(config, run_dir)
     write_summary(run_dir, summary)
     console.print(report.render(summary, run_dir))
     _complain(end, run_dir)
@@ -76,43 +86,56 @@ def write_summary(run_dir: RunDir, summary: Summary) -> None:
     write_atomic(run_dir.summary_path, (json.dumps(summary, indent=2) + "\n").encode())
 
 
+def _wanted(config: RunConfig) -> list[str]:
+    """The run's processes."""
+    return [name for name in channels.PROCESSES if name != channels.RECORDER or config.recorder.record]
+
+
 def _carry_out(
     config: RunConfig, run_dir: RunDir, watch: Watch, screen: Screen, clock: MonotonicClock
 ) -> End:
-    """Start the processes, watch them, end them."""
-    wanted = [name for name in channels.PROCESSES if name != channels.RECORDER or config.recorder.record]
-    supervisor = Supervisor({name: command_for(name, run_dir.path) for name in wanted}, run_dir.logs_dir)
-    interrupts = Interrupts()
+    """Start the processes, watch over them, end them."""
+    interrupts, wanted = Interrupts(), _wanted(config)
     viewer = Viewer(config.recorder, run_dir.logs_dir / "viewer.out")
+    lookout = Lookout(watch, Vitals(config.supervise.stuck_s), screen, viewer, clock)
+    supervisor = Supervisor(
+        {name: command_for(name, run_dir.path) for name in wanted},
+        run_dir.logs_dir,
+        restarts=Restarts(config.supervise),
+        vitals=lookout.vitals,
+        tell=lookout.happened,
+    )
     with interrupts.counted(), supervisor.started():
         os.nice(NICENESS)
         with (
             realtime.out_of_the_way(config.agent.rt),
-            open_bus("client", run_dir.run_name, run_dir.socket_dir(), clock=clock) as bus,
+            logged(run_dir.log_path(channels.LAUNCHER)),
+            open_bus(
+                "client", run_dir.run_name, run_dir.socket_dir(), clock=clock, secure=config.link.secure
+            ) as bus,
             closing(viewer),
             screen.shown(),
         ):
-            return _watch_over(supervisor, interrupts, bus, watch, screen, viewer)
-
-
-def _watch_over(
-    supervisor: Supervisor, interrupts: Interrupts, bus: Bus, watch: Watch, screen: Screen, viewer: Viewer
-) -> End:
-    ledgers = bus.queue(channels.STATS, "*")
-
-    def poll(waiting_for: frozenset[str]) -> None:
-        for received in ledgers.drain():
-            watch.feed(received.message, received.received_ns)
-        if viewer.due and watch.heard(channels.RECORDER):
-            viewer.open()
-            screen.say(f"view {viewer.address}")
-        if waiting_for:
-            screen.note = "ending: " + ", ".join(name for name in channels.PROCESSES if name in waiting_for)
-        screen.update()
-
-    end = supervisor.supervise(interrupts, poll)
-    poll(frozenset())  # the last messages
+            lookout.join(bus)
+            end = supervisor.supervise(interrupts, lookout.look)
+            lookout.look(frozenset())  # the last messages
+    unfinished = channels.RECORDER in wanted and not supervisor.ended_well(channels.RECORDER)
+    if unfinished and end.reason != "killed":
+        mend(run_dir.recording_path, hurried=end.reason == "interrupted")
     return end
+
+
+def _told(happenings: Sequence[Happening], run_dir: RunDir, began_ns: int) -> list[Summary]:
+    """Deaths and restarts for the summary, in run time; in seconds since the start if there was no T0."""
+    try:
+        beginning = epoch.read(run_dir.epoch_path)
+    except ConfigError:  # damaged: the env server has said so
+        beginning = None
+    t0_ns = began_ns if beginning is None else beginning.t0_ns
+    return [
+        {"at_s": (one.at_ns - t0_ns) / 1e9, "process": one.process, "what": one.what, "code": one.code}
+        for one in happenings
+    ]
 
 
 def _why(end: End, config: RunConfig, watch: Watch) -> str:
@@ -123,7 +146,7 @@ def _why(end: End, config: RunConfig, watch: Watch) -> str:
         return "interrupted"
     env = watch.totals(channels.ENV_SERVER).counters
     whole = config.duration_s * (config.env.hz or 1.0)
-    reached = config.duration_s > 0 and env["ticks"] + env["skipped"] >= int(whole)
+    reached = config.duration_s > 0 and sum(env[name] for name in PASSED) >= int(whole)
     return "duration" if reached else "stopped"
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from launcher import options, report
+from launcher import options, regret, report
 from launcher.cli import DONE
 from launcher.drawing import clock
 from launcher.run import default_path, write_summary
@@ -40,6 +40,7 @@ def run_sim(argv: Sequence[str]) -> int:
         ended="interrupted" if stop.is_set() else "duration",
         clock="virtual",
     )
+    summary |= regret.of_run(config, run_dir)
     write_summary(run_dir, summary)
     console.print(report.render(summary, run_dir))
     return DONE

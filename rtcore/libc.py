@@ -36,6 +36,7 @@ _clock_nanosleep = _load(
 )
 _prctl = _load("prctl", ctypes.c_int, *[ctypes.c_ulong] * 4)
 _mlockall = _load("mlockall", ctypes.c_int)
+_setns = _load("setns", ctypes.c_int, ctypes.c_int)
 
 
 def sleep_until_ns(deadline_ns: int) -> None:
@@ -66,6 +67,15 @@ def mlockall(flags: int) -> None:
         OSError: refused, or no such call on this system.
     """
     _checked("mlockall", _mlockall, flags)
+
+
+def setns(namespace: int) -> None:
+    """Move this thread into a namespace, given as a file descriptor.
+
+    Raises:
+        OSError: refused, or no such call on this system.
+    """
+    _checked("setns", _setns, namespace, 0)
 
 
 def _checked(name: str, function: Callable[..., int] | None, *arguments: int) -> int:

@@ -72,7 +72,8 @@ class LineFile(logging.FileHandler):
 
     def _lose(self, error: OSError) -> None:
         if self.lost == 0:
-            sys.stderr.write(f"{self.baseFilename}: log lines are lost: {error}\n")
+            with suppress(OSError):  # it may be a file on the same disk
+                sys.stderr.write(f"{self.baseFilename}: log lines are lost: {error}\n")
         self.lost += 1
         stream, self.stream = self.stream, None  # with what is in its buffer
         if stream is not None:

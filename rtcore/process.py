@@ -11,21 +11,27 @@ import argparse
 import logging
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from rtcore import channels, realtime
+from rtcore import channels, realtime, signing
 from rtcore.bus import Bus, BusError
 from rtcore.clock import Clock
 from rtcore.config import ConfigError, RunConfig
 from rtcore.ledger import Ledger
-from rtcore.lifecycle import Continuations, Stop, die_with_parent, log_to_file, stop_on_signals
+from rtcore.lifecycle import Continuations, Stop, die_with_parent, stop_on_signals
+from rtcore.log_files import log_to_file
 from rtcore.messages import Stats
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir
-from rtcore.zenoh_bus import open_bus
+from rtcore.tally import Tally
+from rtcore.zenoh_bus import ZenohBus, open_bus, open_bus_by_router
+from rtcore.zenoh_refusals import LOG_FILTER
+from rtcore.zenoh_session import leave
+from rtcore.zenoh_watch import watched
 
 REPORT_PERIOD_S = 0.25  # the rate in the channel table
 JOIN_LIMIT_S = 2.0  # a thread blocked in a put is left behind, so that a process ends within 5 s
@@ -42,8 +48,10 @@ class Process:
     bus: Bus
     ledger: Ledger
     stop: Stop
-    incarnation: int  # its start, monotonic ns
+    incarnation: int  # greater than those of its earlier lives
     continuations: Continuations
+    signer: signing.Signer  # the learner's, of policies
+    verifier: signing.Verifier  # the agent's
 
 
 class Reporter:
@@ -69,7 +77,10 @@ class Reporter:
         if self._continuations is not None:
             for at_ns in self._continuations.untold_ns():
                 self._ledger.event(at_ns, "WARN", f"{self._process}: was stopped, and runs again")
-        self._ledger.set_counter("messages.rejected", sum(self._bus.rejected().values()))
+        rejected = self._bus.rejected()
+        self._ledger.set_counter("messages.rejected", sum(rejected.values()))
+        for channel, count in rejected.items():
+            self._ledger.set_counter(f"messages.rejected.{channel}", count)
         return self._ledger.stats(self._clock.now_ns(), final=final)
 
     def publish(self, stats: Stats) -> None:
@@ -97,6 +108,12 @@ def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--listen", action="append", default=[], metavar="EP", help="further endpoint to offer"
     )
+    parser.add_argument(
+        "--router",
+        default="",
+        metavar="EP",
+        help="Zenoh router to reach the others through, and nothing else",
+    )
     parser.add_argument("--supervised", type=int, metavar="PID", help="end when this parent process ends")
     return parser.parse_args(argv)
 
@@ -105,19 +122,19 @@ def run_process(role: str, serve: Callable[[Process], None], argv: Sequence[str]
     """Open everything a process needs, serve, and close it in order.
 
     Returns:
-        The exit code: 0 done; 2 wrong input, with one line on stderr that says what is wrong; 1 when
-        real-time scheduling is required and refused, or the bus cannot be joined.
+        The exit code: 0 done; 2 what no restart changes, wrong input, or real-time scheduling that is
+        required and refused; 1 when the bus cannot be joined. One line on stderr says what is wrong.
     """
     try:
         with open_process(role, argv) as process:
             serve(process)
-    except ConfigError as error:
+    except (ConfigError, realtime.RealtimeError) as error:
         sys.stderr.write(f"{role}: {error}\n")
-        return WRONG_INPUT
-    except (realtime.RealtimeError, BusError) as error:
+        return leave(WRONG_INPUT)
+    except BusError as error:
         sys.stderr.write(f"{role}: {error}\n")
-        return FAILED
-    return DONE
+        return leave(FAILED)
+    return leave(DONE)
 
 
 @contextmanager
@@ -136,19 +153,24 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
     log_to_file(run_dir.log_path(role), role)
     placement = realtime.enter(role, config.agent.rt)  # before the bus: its threads inherit it
     clock = MonotonicClock()
-    incarnation = clock.now_ns()
-    ledger = Ledger(role, incarnation)
-    connect, listen = (*config.link.connect, *arguments.connect), (*config.link.listen, *arguments.listen)
+    incarnation = run_dir.next_incarnation(role, time.time_ns())
+    name = run_dir.run_name
+    signer, verifier = (
+        signing.open_signer(config.link, role, name),
+        signing.open_verifier(config.link, role, name),
+    )
     stop, continuations = Stop(), Continuations(clock.now_ns)
     with (
+        _ledger(run_dir, role, incarnation, clock) as ledger,
         stop_on_signals(stop),
         continuations.watched(),
-        open_bus(
-            role, run_dir.run_name, run_dir.socket_dir(), clock=clock, connect=connect, listen=listen
-        ) as bus,
+        watched(ledger, clock) if config.link.secure else nullcontext(),
+        _open_bus(role, arguments, run_dir, config, clock) as bus,
     ):
-        ledger.event(incarnation, "INFO", f"{role}: {placement.describe()}")
-        process = Process(config, run_dir, clock, bus, ledger, stop, incarnation, continuations)
+        ledger.event(clock.now_ns(), "INFO", f"{role}: {placement.describe()}")
+        process = Process(
+            config, run_dir, clock, bus, ledger, stop, incarnation, continuations, signer, verifier
+        )
         reporter = Reporter(ledger, bus, clock, role, continuations)
         try:
             with background(reporter.run, name="reporter", ends=stop):
@@ -159,8 +181,54 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
             raise
         finally:
             last = reporter.snapshot(final=True)
-            run_dir.write_final_stats(last)
+            _keep(run_dir, last)
             reporter.publish(last)
+
+
+def _keep(run_dir: RunDir, last: Stats) -> None:
+    """Write the last ledger down. On a full disk there is still the tally, and what was said on the bus."""
+    try:
+        run_dir.write_final_stats(last)
+    except OSError as error:
+        logging.getLogger(last.process).warning("the last ledger is not on disk: %s", error)
+
+
+def _open_bus(
+    role: str, arguments: argparse.Namespace, run_dir: RunDir, config: RunConfig, clock: Clock
+) -> ZenohBus:
+    """The process's connection to the run."""
+    link = config.link
+    if arguments.router:
+        if link.secure:
+            raise ConfigError(
+                "router", arguments.router, "not with link.secure: it would speak for everybody"
+            )
+        return open_bus_by_router(role, run_dir.run_name, arguments.router, clock=clock)
+    return open_bus(
+        role,
+        run_dir.run_name,
+        run_dir.socket_dir(),
+        clock=clock,
+        connect=(*link.connect, *arguments.connect),
+        listen=(*link.listen, *arguments.listen),
+        secure=link.secure,
+        log_filter=LOG_FILTER if link.secure else "",
+    )
+
+
+@contextmanager
+def _ledger(run_dir: RunDir, role: str, incarnation: int, clock: Clock) -> Iterator[Ledger]:
+    """The process's ledger with its tally; without one where the disk has no place for it."""
+    with ExitStack() as stack:
+        try:
+            tally = stack.enter_context(Tally.create(run_dir.tally_path(role, incarnation)))
+        except OSError as error:
+            ledger = Ledger(role, incarnation)
+            ledger.count("tally.unbacked")
+            ledger.event(clock.now_ns(), "WARN", f"{role}: counters die with the process: no tally ({error})")
+        else:
+            ledger = Ledger(role, incarnation, tally)
+        yield ledger
 
 
 @contextmanager

@@ -12,27 +12,28 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Generic, Protocol
 
 import zenoh
 from zenoh import ext, handlers
 
 from rtcore.base_bus import BaseBus
-from rtcore.bus import BusClosedError, BusError, Publisher
+from rtcore.bus import BusError, Publisher
 from rtcore.channels import ALIVE_KEY, CONTROL_KEY, Channel, Delivery, MessageT
 from rtcore.clock import Clock
-from rtcore.codec import Codec, check_name, key_for
+from rtcore.codec import Codec, check_name, key_for, name_in
 from rtcore.commands import CommandClient, CommandServer
 from rtcore.inbox import Bell, Inbox, ThreadBell
 from rtcore.lossless import Fetch, LosslessFeed
 from rtcore.messages import Command, CommandReply
-from rtcore.zenoh_config import session_config
-from rtcore.zenoh_session import open_session, realtime_publisher, realtime_subscriber
+from rtcore.signing import OPERATOR, identity
+from rtcore.zenoh_access import FLUSH_KEY
+from rtcore.zenoh_config import CLIENT, Security, session_config
+from rtcore.zenoh_ports import local_ports
+from rtcore.zenoh_router import through_router
+from rtcore.zenoh_senders import LOSSLESS_CACHE, ZenohPublisher, declare_sender
+from rtcore.zenoh_session import close_session, open_session, realtime_subscriber
 
-LOSSLESS_CACHE = 2000  # batches a publisher keeps: 100 s at 20 a second
-HEARTBEAT_S = 0.5  # how soon a reader learns that it missed a publisher's last message
 FETCH_TIMEOUT_S = 5.0  # for the history of a publisher met in mid-stream
-FLUSH_KEY = "flush"  # query, empty reply: all that was sent to this process before has arrived
 FLUSH_S, FLUSH_RETRY_S = 0.5, 0.02
 JOIN_LIMIT_S = 1.0  # it ends within FETCH_PAUSE_S
 RETRY_S = 0.1  # before an unanswered command's second try; the queue of replies may be empty on reconnection
@@ -46,6 +47,8 @@ def open_bus(
     clock: Clock,
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
+    secure: str = "",
+    log_filter: str = "",
 ) -> ZenohBus:
     """Join a run. Use it in a `with` block: a process that ends without `close` may hang or abort.
 
@@ -58,43 +61,34 @@ def open_bus(
         clock: gives the stamps of received messages.
         connect: further endpoints to connect to.
         listen: further endpoints to listen on.
+        secure: the directory with the keys of this role; empty: unix sockets, and endpoints as they are.
+        log_filter: what Zenoh writes to standard output; see `zenoh_watch`.
 
     Raises:
         ValueError: an argument that no session can be made of.
+        ConfigError: a certificate or an endpoint does not do for secured links.
         BusError: Zenoh refuses, as when a process of this role runs already.
     """
-    settings = session_config(role, run_name, socket_dir, connect=connect, listen=listen)
+    found = identity(secure, OPERATOR if role == CLIENT else role)
+    security = None if found is None else Security(found, local_ports(socket_dir))
+    settings = session_config(role, run_name, socket_dir, connect=connect, listen=listen, security=security)
+    return _join(settings, role, f"the run in {socket_dir}", clock, log_filter)
+
+
+def open_bus_by_router(role: str, run_name: str, router: str, *, clock: Clock) -> ZenohBus:
+    """Join a run by the Zenoh router at the endpoint `router` alone; otherwise see `open_bus`."""
+    settings = through_router(session_config(role, run_name, Path()), router)
+    return _join(settings, role, f"a run by {router}", clock)
+
+
+def _join(settings: dict[str, object], role: str, where: str, clock: Clock, log_filter: str = "") -> ZenohBus:
     try:
-        session = open_session(settings)
+        session = open_session(settings, log_filter)
     except zenoh.ZError as error:
-        raise BusError(
-            f"{role} cannot join the run in {socket_dir} (does it run already?): {error}"
-        ) from error
+        raise BusError(f"{role} cannot join {where} (does it run already?): {error}") from error
     bus = ZenohBus(session, role, clock)
     bus.join()
     return bus
-
-
-class _Sender(Protocol):
-    """A Zenoh publisher, plain or advanced."""
-
-    def put(self, payload: bytes) -> None: ...
-
-
-class _ZenohPublisher(Generic[MessageT]):
-    """Sends on one key; see `rtcore.bus.Publisher`."""
-
-    def __init__(self, codec: Codec[MessageT], sender: _Sender) -> None:
-        self._encode = codec.encode
-        self._sender = sender
-
-    def put(self, message: MessageT) -> None:
-        """Send."""
-        payload = self._encode(message)
-        try:
-            self._sender.put(payload)
-        except zenoh.ZError as error:
-            raise BusClosedError(str(error)) from error
 
 
 def _on_reply(on_sample: Callable[[zenoh.Sample], None], reply: zenoh.Reply) -> None:
@@ -123,10 +117,10 @@ class ZenohBus(BaseBus):
     def publisher(self, channel: Channel[MessageT], name: str = "") -> Publisher[MessageT]:
         """A publisher; see `rtcore.bus.Bus.publisher`."""
         self.check_open()
-        sender = self._sender(key_for(channel, name, wildcard=False), channel.delivery)
+        sender = declare_sender(self._session, key_for(channel, name, wildcard=False), channel.delivery)
         self._held.append(sender)  # with what it keeps for late readers
         self._publishes = True
-        return _ZenohPublisher(Codec(channel, self._rejections), sender)
+        return ZenohPublisher(Codec(channel, self._rejections), sender)
 
     def serve(self, name: str, handler: Callable[[Command], CommandReply]) -> None:
         """Answer commands on a thread of their own; see `rtcore.bus.Bus.serve`."""
@@ -192,7 +186,7 @@ class ZenohBus(BaseBus):
         if first and self._publishes:
             self._flush()
         self._wanted.put(None)
-        self._session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub has no return type
+        close_session(self._session)
         # A thread that comes back from Zenoh while the interpreter ends would abort the process.
         self._fetcher.join(JOIN_LIMIT_S)
 
@@ -230,34 +224,14 @@ class ZenohBus(BaseBus):
             else:
                 self._alive.discard(name)
 
-    def _sender(self, key: str, delivery: Delivery) -> _Sender:
-        drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
-        if delivery is Delivery.REALTIME:
-            return realtime_publisher(self._session, key)
-        if delivery is Delivery.TELEMETRY:
-            return self._session.declare_publisher(key, congestion_control=drop, priority=zenoh.Priority.DATA)
-        if delivery is Delivery.LOSSLESS:
-            depth, every_s, on_change_s = LOSSLESS_CACHE, HEARTBEAT_S, None
-        else:
-            depth, every_s, on_change_s = 1, None, HEARTBEAT_S
-        return ext.declare_advanced_publisher(
-            self._session,
-            key,
-            congestion_control=block,
-            priority=zenoh.Priority.DATA_LOW,
-            cache=ext.CacheConfig(max_samples=depth),
-            publisher_detection=True,
-            sample_miss_detection=ext.MissDetectionConfig(heartbeat=every_s, sporadic_heartbeat=on_change_s),
-        )
-
     def _subscribe(self, key: str, codec: Codec[MessageT], inbox: Inbox, delivery: Delivery) -> None:
-        now_ns, fits, offer = self._clock.now_ns, codec.fits, inbox.offer
+        now_ns, fits, offer, wild = self._clock.now_ns, codec.fits, inbox.offer, "*" in key
 
         def on_sample(sample: zenoh.Sample) -> None:
             received_ns = now_ns()
             payload = sample.payload
             if fits(len(payload)):
-                offer(payload.to_bytes(), received_ns)
+                offer(payload.to_bytes(), received_ns, name_in(str(sample.key_expr)) if wild else "")
 
         if delivery in (Delivery.REALTIME, Delivery.TELEMETRY):
             self._held.append(realtime_subscriber(self._session, key, on_sample))

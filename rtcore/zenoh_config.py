@@ -2,17 +2,23 @@
 
 Peers without a router. Every process offers a unix socket in the run's directory and connects to the
 processes that come before it in `channels.PROCESSES`, so that each pair has one link whatever the
-order in which they start. Each constant below carries the measurement (Zenoh 1.10.2, two cores)
-that set it.
+order in which they start. Where links are secured, a port on the loopback with mutual TLS takes the
+socket's place, and nothing else is spoken. Each constant below carries the measurement (Zenoh 1.10.2, two
+cores) that set it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
 from rtcore import channels
+from rtcore.config import ConfigError
+from rtcore.signing import Identity
+from rtcore.zenoh_access import access_control
+from rtcore.zenoh_ports import HOST
 
 CLIENT = "client"  # the launcher and its commands: offers nothing, connects to all
 SOCKET_PATH_LIMIT = 107  # bytes of a unix socket's path, by the system
@@ -46,8 +52,22 @@ def socket_path(socket_dir: Path, role: str) -> Path:
     return socket_dir / f"{role}.sock"
 
 
+@dataclass(frozen=True)
+class Security:
+    """What a session needs for secured links."""
+
+    identity: Identity
+    ports: Mapping[str, int]  # of all processes, on this machine's loopback
+
+
 def session_config(
-    role: str, run_name: str, socket_dir: Path, *, connect: Sequence[str] = (), listen: Sequence[str] = ()
+    role: str,
+    run_name: str,
+    socket_dir: Path,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    security: Security | None = None,
 ) -> dict[str, object]:
     """The configuration of one process's session, as Zenoh reads it.
 
@@ -57,6 +77,7 @@ def session_config(
         socket_dir: the run's directory for sockets.
         connect: further endpoints to connect to, such as `tcp/host:7447`.
         listen: further endpoints to listen on.
+        security: for secured links; None: unix sockets, and endpoints as they are.
 
     Raises:
         ValueError: an argument that no session can be made of.
@@ -66,19 +87,20 @@ def session_config(
     if not run_name:
         raise ValueError("run_name is empty")
     own, earlier = _own_and_earlier(role)
-    for other in (*own, *earlier):
-        _check_socket_path(socket_path(socket_dir, other))
+    namespace = f"tenuto/{quote(run_name, safe='')}"
+    protocols = _protocols((*connect, *listen), security)
+    secured = {} if security is None else {"access_control": access_control(namespace)}
     return {
         "mode": "peer",
-        "namespace": f"tenuto/{quote(run_name, safe='')}",
+        "namespace": namespace,
         "metadata": {"name": role},
         "listen": {
-            "endpoints": [*(_endpoint(socket_dir, name) for name in own), *listen],
+            "endpoints": [*(_endpoint(socket_dir, name, security) for name in own), *listen],
             "timeout_ms": 0,
             "exit_on_failure": True,  # a socket in use: the process runs already
         },
         "connect": {
-            "endpoints": [*(_endpoint(socket_dir, name) for name in earlier), *connect],
+            "endpoints": [*(_endpoint(socket_dir, name, security) for name in earlier), *connect],
             "timeout_ms": -1,  # retry for ever; 0 would mean once
             "exit_on_failure": False,
             "retry": {
@@ -95,11 +117,22 @@ def session_config(
             "gossip": {"enabled": False},
         },
         "queries_default_timeout": 2000,
-        "transport": _transport(protocols=_protocols((*connect, *listen))),
-    }
+        "transport": _transport(protocols, security),
+    } | secured
 
 
-def _transport(protocols: list[str]) -> dict[str, object]:
+def require_tls(endpoints: Sequence[str]) -> None:
+    """Refuse endpoints that secured links may not have.
+
+    Raises:
+        ConfigError: one is not by TLS.
+    """
+    for endpoint in endpoints:
+        if not endpoint.startswith("tls/"):
+            raise ConfigError("endpoint", endpoint, "must be like tls/host:port, as link.secure is given")
+
+
+def _transport(protocols: list[str], security: Security | None) -> dict[str, object]:
     return {
         # Chunks in shared memory are dropped silently when a receiver stalls for more than 0.1 s.
         "shared_memory": {"enabled": False},
@@ -112,7 +145,23 @@ def _transport(protocols: list[str]) -> dict[str, object]:
                 "queue": {"congestion_control": {"block": {"wait_before_close": BLOCK_US}}},
             },
             "rx": {"max_message_size": MAX_MESSAGE_BYTES},
-        },
+        }
+        | ({} if security is None else {"tls": _tls(security.identity)}),
+    }
+
+
+def _tls(identity: Identity) -> dict[str, object]:
+    """Both ends show a certificate of the same authority; who connects also checks the host's name in it."""
+    certificate, key = str(identity.certificate), str(identity.key)
+    return {
+        "root_ca_certificate": str(identity.authority),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
     }
 
 
@@ -122,8 +171,12 @@ def _own_and_earlier(role: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return (role,), channels.PROCESSES[: channels.PROCESSES.index(role)]
 
 
-def _endpoint(socket_dir: Path, role: str) -> str:
-    return f"unixsock-stream/{socket_path(socket_dir, role)}"
+def _endpoint(socket_dir: Path, role: str, security: Security | None) -> str:
+    if security is not None:
+        return f"tls/{HOST}:{security.ports[role]}"
+    path = socket_path(socket_dir, role)
+    _check_socket_path(path)
+    return f"unixsock-stream/{path}"
 
 
 def _check_socket_path(path: Path) -> None:
@@ -134,8 +187,11 @@ def _check_socket_path(path: Path) -> None:
         raise ValueError(f"socket path {text}: must be without any of ? # ;")
 
 
-def _protocols(endpoints: Sequence[str]) -> list[str]:
+def _protocols(endpoints: Sequence[str], security: Security | None) -> list[str]:
     for endpoint in endpoints:
         if "/" not in endpoint:
             raise ValueError(f"endpoint {endpoint!r}: must be like tcp/host:port")
+    if security is not None:
+        require_tls(endpoints)
+        return ["tls"]
     return sorted({"unixsock-stream", *(endpoint.partition("/")[0] for endpoint in endpoints)})

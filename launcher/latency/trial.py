@@ -120,6 +120,7 @@ def trial_config(
             learning_starts=min(learner.learning_starts, learner.batch),
         ),
         recorder=replace(base.recorder, record=record),
+        supervise=replace(base.supervise, limit=0),  # what somebody died in is no measurement
     )
     check(config)
     return replace(config, env=worlds.resolve(config.env))

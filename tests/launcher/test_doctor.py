@@ -199,7 +199,7 @@ def test_without_privileges_it_foretells_what_require_does(tmp_path: Path) -> No
     assert "prlimit" in told.stdout or "docker run --cap-add SYS_NICE" in told.stdout
     arguments = ["env", "pointmass", "--agent.rt", "require", "--run-dir", "run"]
     refused = without_privileges(*arguments, cwd=tmp_path)
-    assert refused.returncode == 1
+    assert refused.returncode == 2
     assert "env_server is refused SCHED_FIFO, locked memory" in refused.stderr
 
 

@@ -67,6 +67,7 @@ def test_all_files_are_complete(finished: Finished) -> None:
     assert run_dir.recording_path.stat().st_size > 0
     assert len(run_dir.read_final_stats()) == 4
     assert all(stats.final for stats in run_dir.read_final_stats())
+    assert all(0 < stats.beat_ns <= stats.at_ns for stats in run_dir.read_final_stats())
     assert run_dir.config().seed == 3
     assert not (finished.path / "link").exists()
 

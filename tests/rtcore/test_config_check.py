@@ -274,7 +274,6 @@ def test_a_drift_is_consistent(name: str) -> None:
 @pytest.mark.parametrize(
     ("learner", "message"),
     [
-        ({"algo": "q"}, "learner.schedule.kind = 'auto': must go with learner.algo npg or fsac"),
         ({"algo": "rsac"}, "learner.schedule.kind = 'auto': must go with learner.algo npg or fsac"),
         (
             {"algo": "npg", "forecast": ForecastConfig(kind="none")},

@@ -103,6 +103,19 @@ def test_lines_that_a_full_disk_does_not_take_are_counted_where_they_are_missing
     assert capsys.readouterr().err.count("log lines are lost") == 1
 
 
+def test_a_full_disk_that_stderr_lies_on_too_costs_the_complaint_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, logger = tmp_path / "recorder.jsonl", logging.getLogger("recorder")
+    with (tmp_path / "recorder.out").open("w", buffering=1) as stderr, log_to_file(path, "recorder"):
+        monkeypatch.setattr("sys.stderr", stderr)  # as under a launcher
+        with files_of_at_most(0):
+            logger.info("lost")
+        logger.info("after")
+        monkeypatch.undo()
+    assert [line["text"] for line in lines(path)] == ["1 log lines were lost before this one", "after"]
+
+
 def test_a_directory_that_cannot_be_made_costs_the_lines_and_nothing_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

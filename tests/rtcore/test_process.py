@@ -5,11 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from rtcore import channels
+from rtcore import channels, process, realtime
 from rtcore.bus import BusError
 from rtcore.clock import VirtualClock
 from rtcore.config import EnvConfig, RunConfig
@@ -66,6 +67,17 @@ def test_a_run_directory_that_is_none_is_one_line_and_exit_code_2(tmp_path: Path
     assert done.returncode == 2
     assert done.stderr.startswith("agent_service: run_dir = ") and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_no_restart_changes_is_exit_code_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(role: str, argv: Sequence[str] | None) -> None:
+        raise realtime.RealtimeError(role, [realtime.FIFO])
+
+    monkeypatch.setattr(process, "open_process", refused)
+    assert process.run_process(channels.AGENT, lambda opened: None) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_process_whose_parent_is_gone_ends_at_once(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def npg(rewards: tuple[float, ...], **forecast: object) -> Npg:
     """One pull of arm 0 in each unit; Q(0) is the newest reward. gamma = 1/2, tau = 1, eta = 1/4."""
     replay = Replay(100, 1, 1)
     table = {"step_size": 1.0, "epsilon": 0.0, "eta": 0.25, "entropy": 1.0}
-    config = table_config("npg", forecast={"kind": "forq", "l_p": 3} | forecast, **table)  # type: ignore[arg-type]
+    config = table_config("npg", forecast={"kind": "forq", "l_p": 3} | forecast, **table)
     found = Npg(config, BANDIT, 0, replay)
     for unit, reward in enumerate(rewards):
         pull(replay, 0, reward, unit=unit)
