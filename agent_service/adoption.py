@@ -19,7 +19,8 @@ from rtcore.signing import NoVerifier, Verifier
 from rtcore.spaces import Spaces
 from rtcore.weights import WeightsError, verify
 
-NEWEST = "policies.newest"  # a counter: the newest version that this life took
+# Counters: the first and the newest version that this life took, and policies that were not the learner's.
+FIRST, NEWEST, FOREIGN = "policies.first", "policies.newest", "policies.foreign"
 COMPLAINT_NS = 1_000_000_000  # at most one line in so long about refused policies
 
 
@@ -37,13 +38,19 @@ class Past:
     floor: int = 0
     keep: Callable[[Policy], None] | None = None
 
+    @property
+    def known(self) -> int:
+        """The newest version that was there before this life; 0: none was."""
+        return max(self.floor, self.newest.version if self.newest is not None else 0)
+
 
 class Adoption:
     """Candidates for the swap. One thread offers, one takes.
 
     Counts `policies.received`, `.rejected` and `.superseded` (replaced by a newer one before it acted);
     a repeat of the newest version, which a late or reconnected reader gets, counts as `.repeated` alone. One
-    that is older than the newest is rejected and counts as `.past` besides: it was there before.
+    that is older than the newest is rejected and counts as `.past` besides: it was there before. One that the
+    verifier refuses was never the learner's: it counts as `.foreign` alone.
     """
 
     def __init__(
@@ -72,6 +79,12 @@ class Adoption:
 
     def offer(self, policy: Policy, now_ns: int) -> None:
         """Check a policy and make it ready; a bad one is refused, counted and reported."""
+        try:
+            self._verifier.check(policy)
+        except WeightsError as error:
+            self._ledger.count(FOREIGN)
+            self._complain(now_ns, f"policy {policy.version} refused: {error}")
+            return
         if policy.version == self._newest_version:
             self._ledger.count("policies.repeated")
             return
@@ -90,19 +103,17 @@ class Adoption:
         if self._past.keep is not None:
             self._past.keep(policy)
         self._newest_version = policy.version
-        self._note(policy.version)
-        self._ledger.count("policies.received")
+        self._count(policy.version)
         if self.take() is not None:
             self._ledger.count("policies.superseded")
         self._ready.append((ready, policy))
 
-    def _note(self, version: int) -> None:
-        """What of this life a summary over several needs: a later one gets the newest again. Before it counts
-        as received: a kill in between makes it received in the next life, and never twice in none.
+    def _count(self, version: int) -> None:
+        """As received, with what a summary over several lives needs: a later one gets the newest again, and
+        whether this one had it must not depend on when it was killed.
         """
-        if not self._ledger.counter("policies.first"):
-            self._ledger.set_counter("policies.first", version)
-        self._ledger.set_counter(NEWEST, version)
+        first = self._ledger.counter(FIRST) or version
+        self._ledger.count_together("policies.received", values={FIRST: first, NEWEST: version})
 
     def _complain(self, now_ns: int, text: str) -> None:
         """Report a refusal, if none was in the last second; all are counted."""
@@ -118,7 +129,6 @@ class Adoption:
             return None
 
     def _prepare(self, policy: Policy) -> ActingPolicy:
-        self._verifier.check(policy)
         arrays = verify(policy, self._spaces)
         if self._spaces.finite:
             return CategoricalPolicy(policy.version, arrays["probability"])

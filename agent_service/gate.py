@@ -30,10 +30,8 @@ class Gate:
         self._slack = 0 if spec.host else SLACK_TICKS
         self._freshness = Freshness(spec.tick_ns)
         self._newest = -1  # tick that was answered last
-        self._refused, self._in_a_row = (
-            -1,
-            0,
-        )  # tick that was too old last, and how many of them rose in a row
+        # The tick that was too old last, and how many of them rose in a row.
+        self._refused, self._in_a_row = -1, 0
 
     def judge(self, step: Step, received_ns: int) -> Fault:
         """What is wrong with `step`: `invalid`, it cannot be of this world, or of now; `repeated`, it, or a

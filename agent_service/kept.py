@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 
-from agent_service.adoption import NEWEST, Past
+from agent_service.adoption import FOREIGN, NEWEST, Past
 from rtcore import channels, tally
 from rtcore.clock import Clock
 from rtcore.files import write_atomic
@@ -52,8 +52,12 @@ class Kept:
         return max(good, key=lambda policy: policy.version, default=None)
 
     def keep(self, policy: Policy) -> None:
-        """Write it down, unless the learner does; off the acting thread, it waits for the disk."""
-        if self._run_dir.policy_path.exists():
+        """Write it down, unless the learner has; off the acting thread, it waits for the disk.
+
+        The learner's file may be there and older: of an earlier run on this host, or its disk is full.
+        """
+        learners = self._run_dir.read_policy()
+        if learners is not None and learners.version >= policy.version and self._flaw(learners) is None:
             return
         path = self._run_dir.adopted_path
         try:
@@ -64,13 +68,20 @@ class Kept:
             self._say(f"policy {policy.version} not on disk: {error}")
 
     def _is_right(self, policy: Policy) -> bool:
+        flaw = self._flaw(policy)
+        if flaw is None:
+            return True
+        self._ledger.count(FOREIGN)
+        self._say(f"policy {policy.version} from a file refused: {flaw}")
+        return False
+
+    def _flaw(self, policy: Policy) -> WeightsError | None:
+        """Why it is not the learner's; None: it is."""
         try:
             self._verifier.check(policy)
         except WeightsError as error:
-            self._ledger.count_together("policies.received", "policies.rejected")
-            self._say(f"policy {policy.version} from a file refused: {error}")
-            return False
-        return True
+            return error
+        return None
 
     def _say(self, text: str) -> None:
         self._ledger.event(self._clock.now_ns(), "WARN", text)

@@ -216,7 +216,8 @@ class AgentService:
         self._evidence.swapping.start()
         self._policy, policy = ready
         now_ns = self._clock.now_ns()
-        self._publish_to_adopt.record(max(0, now_ns - policy.created_ns))
+        if policy.version > self._past.known:  # another says how long the agent was away
+            self._publish_to_adopt.record(max(0, now_ns - policy.created_ns))
         self._ledger.count("policies.adopted")
         self._ledger.gauge("policy_version", policy.version)
         self._ledger.event(

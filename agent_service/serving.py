@@ -19,6 +19,8 @@ def serve(process: Process) -> None:
     )
     process.bus.serve(channels.AGENT, service.command)
     process.bus.declare_alive(channels.AGENT)
-    with evidence.gathered(), background(service.check_policies, name="policies", ends=process.stop):
-        service.run(process.stop)
-    service.close()
+    try:
+        with evidence.gathered(), background(service.check_policies, name="policies", ends=process.stop):
+            service.run(process.stop)
+    finally:  # whatever acting failed with, every policy has its fate
+        service.close()

@@ -45,6 +45,7 @@ COMMANDS = (
     Command("learn", "launcher.process:learn", "the learner alone"),
     Command("record", "launcher.process:record", "the recorder alone"),
     Command("status", "launcher.control:status", "what each process of a run is doing"),
+    Command("health", "launcher.health:health", "whether one process's loop turns, as an exit code"),
     Command("hold", "launcher.control:hold", "hold the policy of a running system"),
     Command("resume", "launcher.control:resume", "go on with the schedule after a hold"),
     Command("schedule", "launcher.control:schedule", "change the schedule of a running learner"),
@@ -64,8 +65,15 @@ COMMANDS = (
         "launcher.plan.command:plan",
         "how long to update and to hold, by the paper's bound",
     ),
+    Command(
+        "chaos",
+        "launcher.chaos.command:chaos",
+        "a run whose processes are killed and stopped at random, and whether it kept its promises",
+    ),
     Command("report", "launcher.report:report", "a run's report again"),
     Command("view", "launcher.view:view", "open a run's recording in Rerun"),
+    Command("router", "launcher.router:router", "a Zenoh router, for processes on other machines"),
+    Command("compose", "launcher.deploy:compose", "the compose.yaml of a run in containers"),
     Command("keys", "launcher.keys:keys", "make the certificates and keys for --link.secure"),
 )
 

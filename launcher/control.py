@@ -16,6 +16,7 @@ from launcher import drawing
 from launcher.cli import DONE, CommandError
 from launcher.parsing import parse
 from launcher.run import RUNS
+from learner.schedule.timetable import require_constants
 from rtcore import channels
 from rtcore.bus import Bus, BusError, NoAnswerError
 from rtcore.config import ConfigError, ScheduleConfig
@@ -92,9 +93,8 @@ def schedule(argv: Sequence[str]) -> int:
     default = ScheduleOptions(run_dir=run_dir.path, **shared)
     options = parse(ScheduleOptions, argv, prog="tenuto schedule", description=description, default=default)
     wanted = ScheduleConfig(**{name: getattr(options, name) for name in shared})
-    check(
-        replace(config, learner=replace(config.learner, schedule=wanted))
-    )  # wrong input even if nothing runs
+    check(replace(config, learner=replace(config.learner, schedule=wanted)))  # wrong even if nothing runs
+    require_constants(wanted)
     return _order(run_dir, "schedule", channels.LEARNER, wanted)
 
 

@@ -16,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction
 from env_server.worlds import registry as worlds
 from launcher import presets
 from launcher.parsing import HELP_FLAGS, given, parse
-from learner.schedule.timetable import best
+from learner.schedule.timetable import require_constants
 from rtcore.config import (
     AgentConfig,
     ConfigError,
@@ -93,7 +93,7 @@ def read(
         ConfigError: anything about it is wrong. Nothing was created.
         SystemExit: help was printed.
     """
-    argv = [SHORT.get(token, token) for token in argv]
+    argv = [_whole(token) for token in argv]
     wants_help = any(token in HELP_FLAGS for token in argv)
     plain = [token for token in argv if token not in HELP_FLAGS]
     try:
@@ -114,8 +114,7 @@ def _resolved(config: RunConfig) -> RunConfig:
     link = replace(config.link, secure=_absolute(config.link.secure))
     resolved = replace(config, env=worlds.resolve(config.env), link=link)
     check(resolved)  # again, now that hz and speed are both known
-    if config.learner.schedule.kind == "optimal":
-        best(config.learner.schedule)
+    require_constants(config.learner.schedule)
     if config.learner.algo == "rsac":
         worlds.require_speed(resolved.env, config.learner.reward)
     return resolved
@@ -136,6 +135,12 @@ def require_keys(link: LinkConfig, roles: Iterable[str], endpoints: Sequence[str
 def _absolute(path: str) -> str:
     """Processes, and commands about them, may start elsewhere."""
     return str(Path(path).absolute()) if path else ""
+
+
+def _whole(token: str) -> str:
+    """A flag as tyro knows it: `--learner.schedule auto` and `--learner.schedule=auto` name the kind."""
+    flag, equals, value = token.partition("=")
+    return SHORT.get(flag, flag) + equals + value
 
 
 def describe(summary: str) -> str:

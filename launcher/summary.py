@@ -175,7 +175,7 @@ def _policies(learner: Totals, agent: Totals, stats: StatsByProcess) -> Summary:
     `unreceived`: no agent lived to get it. The last one of a run often has one of these two.
 
     What the agent got once more has a fate once more, `received_again` of them: the newest one after it was
-    started again, and older ones, which it rejects.
+    started again, and older ones, which it rejects. `foreign` ones were not the learner's, and have none.
     """
     published, received = learner.counters["published"], agent.counters["policies.received"]
     again = _received_again(stats.get(AGENT, ()))
@@ -188,6 +188,7 @@ def _policies(learner: Totals, agent: Totals, stats: StatsByProcess) -> Summary:
         "unused": agent.counters["policies.unused"] + _died_with_a_policy(stats.get(AGENT, ())),
         "unreceived": published - (received - again),
         "received_again": again,
+        "foreign": agent.counters["policies.foreign"],
         "published_in_hold": learner.counters["published_in_hold"],
         "withheld": learner.counters["withheld"],
         "last_version": max(

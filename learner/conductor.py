@@ -66,13 +66,14 @@ class Conductor:
 
     Attributes:
         position: where the run time told last lies.
-        settled: (window, g) of the newest iterate that was due or missed: it will not be again.
+        settled: newest unit whose iterate was due or missed: it will not be again. Not (window, g): another
+            schedule numbers its windows anew.
     """
 
     def __init__(self, windows: WindowClock) -> None:
         self._windows = windows
         self._shown: tuple[Window, Phase] | None = None  # as last announced
-        self.settled = (-1, 0)
+        self.settled = -1
         self._paused = False
         self._worked = False  # the policy was to be improved at some time of the present unit
         self.position: Position | None = None
@@ -87,7 +88,7 @@ class Conductor:
         """Whether an operator holds the policy."""
         return self._paused
 
-    def go_on_from(self, settled: tuple[int, int], *, paused: bool) -> None:
+    def go_on_from(self, settled: int, *, paused: bool) -> None:
         """Go on after an earlier learner of the run. Call it before the first `advance`."""
         self.settled = max(self.settled, settled)
         self._paused = paused
@@ -96,6 +97,13 @@ class Conductor:
         """An operator's hold: no improvement and nothing published until `resume`."""
         self._paused = True
         return self._phase_change(run_time_ns, "operator")
+
+    def rescheduled(self, run_time_ns: int) -> list[Happening]:
+        """The present window, which had no end, was given one: tell it as it is now."""
+        if self.position is None:
+            return []
+        self.position = self._windows.position(min(run_time_ns, self.position.unit_end_ns - 1))
+        return self._phase_change(run_time_ns, "operator" if self._paused else "schedule")
 
     def resume(self, run_time_ns: int) -> list[Happening]:
         """Back to what the schedule says."""
@@ -115,17 +123,16 @@ class Conductor:
         if self.position is None:
             yield from self._enter(run_time_ns)
         assert self.position is not None
-        iterate = (self.position.window.m, self.position.iterate)
-        if self.improving and iterate > self.settled and run_time_ns >= self.position.unit_end_ns - lead_ns:
-            self.settled = iterate
+        unit, end_ns = self.position.unit, self.position.unit_end_ns
+        if self.improving and unit > self.settled and run_time_ns >= end_ns - lead_ns:
+            self.settled = unit
             yield PublishDue(*iterate_of(self.position))
 
     def _leave(self, position: Position) -> Iterator[Happening]:
         """The unit that `position` is in is over."""
         yield UnitEnded(position.unit)
-        iterate = (position.window.m, position.iterate)
-        if position.phase == "update" and iterate > self.settled:
-            self.settled = iterate
+        if position.phase == "update" and position.unit > self.settled:
+            self.settled = position.unit
             if self._worked:  # a unit that an operator held throughout misses nothing
                 yield PublishMissed(*iterate_of(position))
 

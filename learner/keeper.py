@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty, Queue
 from typing import NamedTuple
 
 from learner import checkpoint
@@ -47,7 +47,7 @@ class Keeper:
         self._clock, self._ledger = clock, ledger
         self._replay: Replay | None = None
         self._due_ns = 0
-        self._waiting: SimpleQueue[_Copy] = SimpleQueue()
+        self._waiting: Queue[_Copy] = Queue()
         self._writing = threading.Lock()
         self._failed = False
         self._offered = self._done = 0  # numbers of copies

@@ -33,7 +33,7 @@ class Beginning:
         place: committed together with the replay.
         counted: counters of the learners before.
         published: policies so far.
-        settled: newest iterate that was due or published: (window, g).
+        settled: newest unit whose iterate was due or published.
     """
 
     replay: Replay
@@ -41,7 +41,7 @@ class Beginning:
     place: Place
     counted: Counter[str]
     published: Published
-    settled: tuple[int, int]
+    settled: int
 
 
 def meet(
@@ -88,7 +88,7 @@ def meet(
     newest = published.policy
     settled = place.course.settled
     if newest is not None:  # it reaches the disk before anybody gets it
-        settled = max(settled, (newest.window, newest.iterate))
+        settled = max(settled, (newest.created_ns - spec.t0_ns) // spec.unit_ns)
     return Beginning(replay, algorithm, place, counted, published, settled)
 
 

@@ -53,6 +53,8 @@ class Orders:
         if order.schedule is not None and position is not None:
             text = self._scheduler.change(order.schedule, position)
         self._ledger.event(now_ns, "INFO", f"operator: {text}")
+        if order.verb == "schedule":
+            return self._conductor.rescheduled(now_ns - t0_ns)
         if order.verb == "resume":
             return self._conductor.resume(now_ns - t0_ns)
         if order.verb == "hold":

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty, Queue
 
 import msgspec
 
@@ -61,7 +61,7 @@ class Outbox:
         self._signer = signer or NoSigner()
         self._clock = clock
         self._ledger = ledger
-        self._waiting: SimpleQueue[_Item] = SimpleQueue()
+        self._waiting: Queue[_Item] = Queue()
         self._policies = bus.publisher(channels.POLICY)
         self._windows = bus.publisher(channels.WINDOW)
         self._policy_path = run_dir.policy_path

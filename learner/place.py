@@ -17,7 +17,7 @@ class Course(NamedTuple):
     """What the service does with what it takes in."""
 
     earned: float = 0.0  # gradient steps, by all learners of the run
-    settled: tuple[int, int] = (-1, 0)  # newest iterate that was due: (window, g)
+    settled: int = -1  # newest unit whose iterate was due
     paused: bool = False  # by an operator
 
 

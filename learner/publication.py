@@ -12,7 +12,6 @@ from rtcore.clock import Clock
 from rtcore.ledger import Ledger
 from rtcore.messages import Phase, Policy, Spec, WindowNotice
 from rtcore.weights import pack, sha256
-from rtcore.windows import WindowClock
 
 
 class Publication:
@@ -36,17 +35,14 @@ class Publication:
         """Number the next policy after `version`, the last one of an earlier learner of this run."""
         self._version = version
 
-    def publish(
-        self, algorithm: Algorithm, due: PublishDue, spec: Spec, clock: Clock, windows: WindowClock
-    ) -> None:
-        """Publish the policy as it is, unless nothing has changed or its time is over meanwhile."""
+    def publish(self, algorithm: Algorithm, due: PublishDue, spec: Spec, clock: Clock) -> None:
+        """Publish the policy as it is, unless nothing has changed or its unit is over meanwhile."""
         if not self.improved:
             return
         weights = pack(algorithm.policy_arrays())
         digest = sha256(weights)
         created_ns = clock.now_ns()
-        position = windows.position(created_ns - spec.t0_ns)
-        if position.window.m != due.window.m or position.phase == "hold":
+        if created_ns - spec.t0_ns > (due.window.start + due.iterate) * spec.unit_ns:
             self.withhold(due.window.m, due.iterate, created_ns)
             return
         self._version += 1

@@ -253,7 +253,7 @@ class LearnerService:
     def _publish(self, due: PublishDue, spec: Spec, algorithm: Algorithm) -> None:
         if self._conductor.improving:
             self._iterate(algorithm, due.iterate)
-            self._publication.publish(algorithm, due, spec, self._clock, self._scheduler.windows)
+            self._publication.publish(algorithm, due, spec, self._clock)
         else:
             self._publication.withhold(due.window.m, due.iterate, self._clock.now_ns())
 

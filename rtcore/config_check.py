@@ -9,6 +9,8 @@ from rtcore.config import DEEP, TABULAR, ConfigError, DriftConfig, ForecastConfi
 from rtcore.config_rules import rule_for
 from rtcore.windows import make_schedule
 
+LONGEST_CHOSEN = 1000  # units; its cost rises with the square: 0.2 s of the learner's thread for 36 states
+
 
 def check(config: RunConfig) -> None:
     """Every field within its range, and the fields consistent with each other.
@@ -92,6 +94,9 @@ def _check_schedule(learner: LearnerConfig) -> None:
             raise ConfigError("learner.schedule.kind", schedule.kind, allowed)
         if learner.forecast.kind == "none" or learner.forecast.parity == "authors":
             raise ConfigError("learner.schedule.kind", schedule.kind, "must have a forecast to choose by")
+        if schedule.l_f > LONGEST_CHOSEN:
+            allowed = f"must be <= {LONGEST_CHOSEN} for a schedule that chooses: it tries every G"
+            raise ConfigError("learner.schedule.l_f", schedule.l_f, allowed)
         if schedule.least_update > schedule.l_f:
             allowed = f"must be <= learner.schedule.l_f, which is {schedule.l_f}"
             raise ConfigError("learner.schedule.least_update", schedule.least_update, allowed)

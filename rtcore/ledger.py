@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rtcore.histogram import Histogram
 from rtcore.messages import EpisodeReturn, Event, Level, Stats, WindowNotice
@@ -61,23 +61,32 @@ class Ledger:
             if self._tally is not None:
                 self._tally.set(name, value)
 
-    def count_together(self, *names: str) -> None:
-        """Add one to each, of at most 16: no snapshot, and no tally, has only some of it."""
+    def count_together(self, *names: str, values: Mapping[str, int] | None = None) -> None:
+        """Add one to each, and take over `values` as `set_counter` does, of at most 16 counters in all: no
+        snapshot, and no tally, has only some of it.
+        """
         with self._lock:
             counters = self._counters
-            for name in names:
-                counters[name] += 1
+            group = {name: counters[name] + 1 for name in names}
+            if values:
+                for name, value in values.items():
+                    self._check_rises(name, value)
+                group |= values
+            counters |= group
             if self._tally is not None:
-                self._tally.set_together({name: counters[name] for name in names})
+                self._tally.set_together(group)
 
     def set_counter(self, name: str, value: int) -> None:
         """Take over a count that is kept elsewhere, such as the bus's; it must not fall either."""
         with self._lock:
-            if value < self._counters[name]:
-                raise ValueError(f"{name}: {value} after {self._counters[name]}: a counter does not fall")
+            self._check_rises(name, value)
             self._counters[name] = value
             if self._tally is not None:
                 self._tally.set(name, value)
+
+    def _check_rises(self, name: str, value: int) -> None:
+        if value < self._counters[name]:
+            raise ValueError(f"{name}: {value} after {self._counters[name]}: a counter does not fall")
 
     def counter(self, name: str) -> int:
         """The counter's value; 0 if nothing was counted."""

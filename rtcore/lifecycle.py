@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import mmap
 import os
-import queue
 import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from rtcore import libc
@@ -21,21 +20,23 @@ class Stop:
     """A flag that is set once, from any thread or signal handler, and that can be waited on.
 
     Not a `threading.Event`: its lock is not re-entrant, so a handler that sets one deadlocks when it
-    interrupts that Event's own `wait` or `set` (seen within 6 s of a signal every 4 ms).
-    `SimpleQueue.put` is re-entrant.
+    interrupts that Event's own `wait` or `set` (seen within 6 s of a signal every 4 ms). Nor a
+    `queue.SimpleQueue`: in Python 3.11 a `get` with a timeout never returns if a signal is handled on its
+    thread after the timeout has passed, as when the process was stopped meanwhile.
     """
 
     def __init__(self) -> None:
         self._is_set = False
         self._reason = ""
-        self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._gate = threading.Lock()  # closed until the flag is set
+        self._gate.acquire()
 
     def set(self, reason: str) -> None:
         """Stop. Only the first reason is kept."""
         if not self._is_set:
             self._reason = reason
             self._is_set = True
-        self._tokens.put(None)
+        self._open()
 
     def is_set(self) -> bool:
         """Whether `set` was called."""
@@ -43,13 +44,13 @@ class Stop:
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` seconds for the flag; say whether it is set."""
-        if not self._is_set:
-            try:
-                self._tokens.get(timeout=max(0.0, timeout_s))
-            except queue.Empty:
-                return self._is_set
-            self._tokens.put(None)  # for the other waiters
-        return True
+        if not self._is_set and self._gate.acquire(timeout=max(0.0, timeout_s)):
+            self._open()  # for the other waiters
+        return self._is_set
+
+    def _open(self) -> None:
+        with suppress(RuntimeError):  # it is open
+            self._gate.release()
 
     @property
     def reason(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import time
 from contextlib import suppress
@@ -46,6 +47,7 @@ class LineFile(logging.FileHandler):
     def __init__(self, path: Path) -> None:
         super().__init__(path, mode="a", encoding="utf-8", delay=True)
         self.lost = 0
+        self._whole = 0  # bytes of the file that are whole lines
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record, and how many before it were lost."""
@@ -53,11 +55,11 @@ class LineFile(logging.FileHandler):
             if self.stream is None:
                 Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
                 self.stream = self._open()
-            if self.lost:
-                self.stream.write(self._of_lost(record))
-            self.stream.write(self.format(record) + self.terminator)
+                self._whole = os.fstat(self.stream.fileno()).st_size
+            line = self.format(record) + self.terminator
+            self.stream.write(self._of_lost(record) + line if self.lost else line)
             self.flush()
-            self.lost = 0
+            self.lost, self._whole = 0, os.fstat(self.stream.fileno()).st_size
         except OSError as error:
             self._lose(error)
         except (TypeError, ValueError, KeyError):  # arguments that do not fit the text
@@ -79,6 +81,8 @@ class LineFile(logging.FileHandler):
         if stream is not None:
             with suppress(OSError):
                 stream.close()
+            with suppress(OSError):  # the next line must not follow half of one
+                os.truncate(self.baseFilename, self._whole)
 
     def _of_lost(self, record: logging.LogRecord) -> str:
         text = f"{self.lost} log lines were lost before this one"

@@ -58,10 +58,12 @@ class LogReader:
         """New steps; those behind a missing one come when it does, or 5 s later without it."""
         steps: list[Step] = []
         # First the batches: what they hold was declared before.
-        batches = [received.message for received in self._batches.drain()]
+        received = self._batches.drain()
         for declared in self._specs.drain():
             self._declare(declared.message)
-        for batch in self._admitted(batches, now_ns):
+        # What came after the caller had looked at its clock is not of the future.
+        latest_ns = max([now_ns, *(one.received_ns for one in received)])
+        for batch in self._admitted([one.message for one in received], latest_ns):
             steps += self.stream.feed(batch)
         if not self.stream.waiting:
             self._waiting_since_ns = None

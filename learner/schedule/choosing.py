@@ -58,6 +58,8 @@ def by_forecasts(config: ScheduleConfig, outlook: Outlook) -> Choice:
         why = f"the change of Q is hardly told from noise (trust {trust:.2f})"
     elif change <= outlook.temperature:
         why = f"no advantage is predicted to change by more than the temperature {outlook.temperature:.3g}"
+    elif unheld == 0:
+        why = "no regret is predicted"
     elif update == config.l_f:
         why = f"no hold is predicted to save {config.least_gain:.0%} of the regret {unheld:.3g}"
     else:

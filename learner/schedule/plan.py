@@ -23,6 +23,7 @@ SHRINK = 10.0  # times the slopes' variance; residuals of neighbouring tables ar
 # changes. There it is 1.02 [1.00, 1.04] with a mean N of 0.1; without trust it is 0.92, and N = 3.
 LEAST_TRUST = 0.5
 LEAST_GAIN = 0.05
+ROUNDING = 1e-12  # of the largest Q: a loss below is no loss; sums of so few doubles round to 1e-15
 
 
 def predicted_regret(q: Floats, policy: Floats) -> Floats:
@@ -43,6 +44,7 @@ def predicted_regret(q: Floats, policy: Floats) -> Floats:
     assert q.shape == policy.shape and len(q) >= 2, "both must be [W + 1, ..., S, A], W >= 1"
     earned = np.einsum("k...sa,g...sa->kg...", q, policy) / q.shape[-2]
     gap = q.max(-1).mean(-1)[:, None] - earned
+    gap = np.where(gap > ROUNDING * np.abs(q).max((0, -2, -1)), gap, 0.0)
     k = np.arange(len(q))
     return np.stack([gap[k, np.minimum(k, update)].sum(0) for update in k[1:]])
 
@@ -116,7 +118,7 @@ def choose(
         trust: rho of `slope_trust`, [...]; None: forecasts are trusted.
         change: of `advantage_change`, [...]; None: it does not count.
         least_change: G = W unless the change is above it: the policy's temperature tau.
-        least_gain: G = W unless another one saves this share of what is predicted for W.
+        least_gain: G = W unless another one saves something, and this share of what is predicted for W.
         least_trust: G = W unless rho is above it.
         least_update: G is at least this; in 1 .. W.
 
@@ -127,7 +129,8 @@ def choose(
     assert 1 <= least_update <= window, "least_update must be in 1 .. W"
     allowed = predicted[least_update - 1 :]
     held: Index = allowed.argmin(0) + least_update
-    worth = predicted[-1] - allowed.min(0) >= least_gain * predicted[-1]
+    gain = predicted[-1] - allowed.min(0)
+    worth = (gain >= least_gain * predicted[-1]) & (gain > 0.0)
     if trust is not None:
         worth &= trust > least_trust
     if change is not None:

@@ -42,15 +42,18 @@ class Scheduler:
         if kept is None:
             return
         try:
-            self._timetable.load(kept)
+            began = self._timetable.load(kept)
         except ValueError as error:
             text = f"the timetable on disk is damaged, windows go on as configured: {error}"
             self._ledger.event(self._clock.now_ns(), "WARN", text)
+            return
+        if began != self._config.learner.schedule:
+            text = "windows go on by the timetable of the learner before, not as configured now: "
+            self._ledger.event(self._clock.now_ns(), "WARN", text + "`tenuto schedule` changes them")
 
     def entered(self, window: Window) -> None:
         """A window was entered: put it on the timeline, with why it is as it is."""
-        self._ledger.gauge("schedule/update", window.update)
-        self._ledger.gauge("schedule/hold", math.nan if window.hold is None else window.hold)
+        self._show(window)
         choice, self._made = self._made, None
         if choice is None:
             return
@@ -73,8 +76,13 @@ class Scheduler:
     def change(self, schedule: ScheduleConfig, position: Position) -> str:
         """Go by another schedule, which was checked, after the present window; says from when."""
         unit = self._timetable.change(schedule, position.window, position.unit)
+        self._show(self._timetable.window_at(position.unit))  # one without end has one now
         self._keep(self._timetable.dump())
         return f"schedule {schedule.kind} from unit {unit} on"
+
+    def _show(self, window: Window) -> None:
+        self._ledger.gauge("schedule/update", window.update)
+        self._ledger.gauge("schedule/hold", math.nan if window.hold is None else window.hold)
 
     def _choose(self, schedule: ScheduleConfig, start: int) -> int:
         assert self._algorithm is not None, "a window begins before the world is known"

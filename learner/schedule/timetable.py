@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -59,11 +60,6 @@ class Timetable:
         self._choose = choose
         self._sections = [self._section(0, 0, config)]
 
-    @property
-    def config(self) -> ScheduleConfig:
-        """What holds now, or as soon as the present window has ended."""
-        return self._sections[-1].config
-
     def window_at(self, t: int) -> Window:
         """See `Schedule`."""
         index = max(i for i, section in enumerate(self._sections) if i == 0 or section.start <= t)
@@ -99,8 +95,11 @@ class Timetable:
         ]
         return json.dumps(sections).encode()
 
-    def load(self, data: bytes) -> None:
+    def load(self, data: bytes) -> ScheduleConfig:
         """Go on by what an earlier `dump` of the same run says.
+
+        Returns:
+            What the run began with.
 
         Raises:
             ValueError: it is not whole; nothing has changed then.
@@ -111,12 +110,20 @@ class Timetable:
             raise ValueError(f"not a timetable: {error!r}") from error
         if not sections or sections[0].start != 0:
             raise ValueError("not a timetable: it must begin at unit 0")
+        if any(after.start <= one.start or after.m <= one.m for one, after in pairwise(sections)):
+            raise ValueError("not a timetable: its sections must rise")
         self._sections = sections
+        return sections[0].config
 
     def _loaded(self, found: dict[str, Any]) -> Section:
         config = msgspec.convert(found["config"], ScheduleConfig)
+        if config.l_f < 1:
+            raise ValueError("not a timetable: a window has no units")
         section = self._section(int(found["start"]), int(found["m"]), config)
-        _chosen(section.schedule).update({int(m): int(update) for m, update in found["chosen"]})
+        chosen = {int(m): int(update) for m, update in found["chosen"]}
+        if not all(m >= 0 and 1 <= update <= config.l_f for m, update in chosen.items()):
+            raise ValueError("not a timetable: a choice is out of its window")
+        _chosen(section.schedule).update(chosen)
         return section
 
     def _section(self, start: int, m: int, config: ScheduleConfig) -> Section:
@@ -139,6 +146,16 @@ def best(config: ScheduleConfig) -> FixedSchedule:
         name = f"learner.schedule.bound.{error.name}"
         raise ConfigError(name, error.value, error.allowed) from error
     return FixedSchedule(config.l_f, max(split.update, 1) / config.l_f)
+
+
+def require_constants(config: ScheduleConfig) -> None:
+    """Whether the bound's constants belong together, if the schedule is the bound's.
+
+    Raises:
+        ConfigError: they do not.
+    """
+    if config.kind == "optimal":
+        best(config)
 
 
 def cut(window: Window, end: int) -> Window:

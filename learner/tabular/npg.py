@@ -36,7 +36,8 @@ class Npg(ForecastingQ):
         super().__init__(config, spaces, seed, replay)
         self._log_policy: Table = np.full(self._q.shape, -np.log(spaces.actions))
         self._newest = 0  # iterate of this window that was made last
-        self._seen = math.nan  # regret that the tables of this window have shown so far
+        self._seen = 0.0  # regret that the tables of this window have shown so far,
+        self._looks = 0  # in so many looks: one as it began, and one at the end of each unit
         self._realised = math.nan  # of the window before, whole
 
     def update(self, *, improve_policy: bool) -> None:
@@ -46,13 +47,14 @@ class Npg(ForecastingQ):
 
     def begin_window(self, window: Window, unit: int) -> None:
         """See `ForecastingQ`."""
+        previous = self._forecaster.made
         super().begin_window(window, unit)
-        if unit != window.start:
-            self._seen = math.nan  # what is seen now is not the whole window's
-
-    def _forecast_made(self) -> None:
-        self._newest = 0
-        self._realised, self._seen = self._seen, self._regret_now()
+        if self._forecaster.made is previous:
+            return
+        end = None if previous is None else previous.window.end
+        whole = previous is not None and end is not None and self._looks == end - previous.window.start + 1
+        self._realised = self._seen if whole else math.nan
+        self._newest, self._seen, self._looks = 0, self._regret_now(), 1
 
     def outlook(self, start: int, length: int) -> Outlook | None:
         """The closed form of what `iterate` would make of a window, and the forecasts for its units."""
@@ -75,6 +77,7 @@ class Npg(ForecastingQ):
         """Unit t ended: keep a copy of the table, and note what regret it shows for the policy."""
         super().end_unit(unit)
         self._seen += self._regret_now()
+        self._looks += 1
 
     def _regret_now(self) -> float:
         """Mean over the states of max_a Q(s, a) - sum_a pi(a|s) Q(s, a): one unit's share of what the
@@ -125,8 +128,8 @@ class Npg(ForecastingQ):
     def state(self) -> State:
         """That of `ForecastingQ`, with how far the window's iterations are."""
         base = super().state()
-        found = {"seen": self._seen, "realised": self._realised}
-        regret = {name: None if math.isnan(value) else value for name, value in found.items()}
+        realised = None if math.isnan(self._realised) else self._realised
+        regret = {"seen": self._seen, "looks": self._looks, "realised": realised}
         return State(base.tensors, base.scalars | {"newest": self._newest} | regret)
 
     def load(self, state: State) -> None:
@@ -137,8 +140,9 @@ class Npg(ForecastingQ):
         """
         super().load(state)
         self._newest = int(state.scalars["newest"])
-        found = (state.scalars[name] for name in ("seen", "realised"))
-        self._seen, self._realised = (math.nan if one is None else float(one) for one in found)
+        self._seen, self._looks = float(state.scalars["seen"]), int(state.scalars["looks"])
+        realised = state.scalars["realised"]
+        self._realised = math.nan if realised is None else float(realised)
 
     def _tables(self) -> dict[str, NDArray[Any]]:
         return super()._tables() | {"log_policy": self._log_policy}

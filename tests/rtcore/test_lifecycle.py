@@ -54,6 +54,45 @@ def test_a_stop_wakes_all_who_wait() -> None:
     assert time.monotonic() - began < 10.0
 
 
+def test_waits_go_on_after_the_process_was_stopped_for_longer_than_they_last() -> None:
+    """On a `queue.SimpleQueue` some of these threads hang for good: those that a signal meets."""
+    code = """
+import signal, threading, time
+from rtcore.lifecycle import Stop
+
+signal.signal(signal.SIGCONT, lambda number, frame: None)
+stop, waits = Stop(), [0] * 20
+
+def run(index):
+    while True:
+        stop.wait(0.05)
+        waits[index] += 1
+
+for index in range(20):
+    threading.Thread(target=run, args=(index,), daemon=True).start()
+print("up", flush=True)
+input()
+before = list(waits)
+time.sleep(0.6)
+print(sum(now > then for now, then in zip(waits, before)), flush=True)
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdin is not None and child.stdout is not None
+        assert child.stdout.readline() == "up\n"
+        for _ in range(12):
+            time.sleep(0.02)
+            child.send_signal(signal.SIGSTOP)
+            time.sleep(0.1)
+            child.send_signal(signal.SIGCONT)
+        child.stdin.write("\n")
+        child.stdin.flush()
+        assert child.stdout.readline() == "20\n"
+        child.kill()
+
+
 def test_signals_that_interrupt_a_stop_at_work_do_not_block_it() -> None:
     """With a threading.Event inside, two signals that set it while it is being set or waited on deadlock."""
     code = """

@@ -89,6 +89,15 @@ def test_a_step_of_the_future_is_refused(rig: Rig, ours: bool, allowed: int) -> 
     assert rig.bus.rejected() == {"log": 2}
 
 
+def test_what_comes_after_the_clock_was_looked_at_is_not_of_the_future(rig: Rig) -> None:
+    rig.specs.put(replace(SPEC, host=this_boot()))
+    looked_ns = rig.clock.now_ns()  # 10 s: tick 200 is over, and 201 is not
+    rig.clock.advance_ns(SECOND // 20)
+    rig.log.put(StepBatch(steps=[make_step(0, tick=201)]))
+    assert [step.tick for step in rig.reader.read(looked_ns)] == [201]
+    assert rig.bus.rejected() == {}
+
+
 def test_another_hosts_clock_tells_nothing_of_the_future(rig: Rig) -> None:
     rig.specs.put(replace(SPEC, host="elsewhere"))
     assert rig.read(make_step(0, tick=10**9)) == [(1, 0)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,15 @@ def test_a_hold_where_the_target_goes_wrong() -> None:
     assert eager.predicted == pytest.approx(held)
     assert eager.why == "predicted regret 4, 4% below 4.18 without a hold"
     assert eager.trust == 1.0
+
+
+def test_no_hold_where_there_is_nothing_to_lose() -> None:
+    """A policy that has arrived where forecasts go on pointing, and with whose best action they only grow."""
+    sure = outlook([[2.0, 0.0], [4.0, 0.0], [9.0, 0.0]], [2000.0, 0.0])
+    arrived = replace(sure, log_policy=np.array([[0.0, -2000.0]]))
+    choice = by_forecasts(ScheduleConfig(kind="auto", l_f=2, least_gain=0.0), arrived)
+    assert (choice.update, choice.predicted, choice.unheld) == (2, 0.0, 0.0)
+    assert choice.why == "no regret is predicted"
 
 
 def test_it_stays_within_its_limit() -> None:

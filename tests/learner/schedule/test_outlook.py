@@ -88,10 +88,20 @@ def test_a_window_entered_midway_is_not_counted() -> None:
     found.begin_window(window(1, 2, 2, 0), 2)
     assert "schedule/realised" not in found.metrics()
     state = found.state()
-    assert (state.scalars["realised"], state.scalars["seen"]) == (None, pytest.approx(2.0))
+    assert (state.scalars["realised"], state.scalars["looks"]) == (None, 1)
     again = npg((4.0,))
     again.load(state)
     assert again.state().scalars == state.scalars
+
+
+def test_units_that_a_dead_learner_missed_make_no_whole_window() -> None:
+    found = npg((4.0,))
+    found.begin_window(window(0, 1, 2, 1), 1)
+    found.end_unit(1)
+    again = npg((4.0,))
+    again.load(found.state())  # units 2 and 3 go by without it
+    again.begin_window(window(1, 4, 2, 1), 4)
+    assert "schedule/realised" not in again.metrics()
 
 
 def test_fsac_foresees_on_a_batch_what_its_critics_forecast() -> None:

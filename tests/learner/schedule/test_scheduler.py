@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -136,3 +137,59 @@ def test_a_damaged_timetable_is_said_and_windows_are_as_configured(run_dir: RunD
     rig.live(0, TICKS)
     assert windows(rig) == {0: (0, 2, 2)}
     assert any("timetable on disk is damaged" in text for text in events(rig))
+
+
+def test_what_was_chosen_is_not_chosen_again(run_dir: RunDir) -> None:
+    first = start(run_dir)
+    first.live(0, 13 * TICKS)
+    first.learner.close()
+    first.learner.outbox.flush()
+    kept = run_dir.learner_dir / "schedule.json"
+    sections = json.loads(kept.read_text())
+    (m, update), others = sections[0]["chosen"][-1], range(1, 5)
+    other = next(number for number in others if number != update)
+    sections[0]["chosen"][-1] = [m, other]
+    kept.write_text(json.dumps(sections))
+    second = start(run_dir)
+    second.live(13 * TICKS + 1, 14 * TICKS)
+    assert windows(second)[m] == (12, other, 4 - other)
+
+
+def test_windows_that_are_numbered_anew_are_improved_in_all_the_same(run_dir: RunDir) -> None:
+    """After 12 windows of one unit, the timetable lost: windows of 4 units, of which the fourth begins."""
+    first = start(run_dir, schedule=ScheduleConfig(kind="live"))
+    first.live(0, 12 * TICKS - 1)
+    assert max(windows(first)) == 11
+    first.learner.close()
+    first.learner.outbox.flush()
+    second = start(run_dir, schedule=ScheduleConfig(l_f=4, gamma_f=0.5))
+    second.live(12 * TICKS, 16 * TICKS - 1)
+    assert windows(second) == {3: (12, 2, 2)}
+    assert [(policy.window, policy.iterate) for policy in second.published()][-2:] == [(3, 1), (3, 2)]
+
+
+def test_another_schedule_than_the_one_that_was_kept_is_said(run_dir: RunDir) -> None:
+    first = start(run_dir)
+    first.live(0, 6 * TICKS)
+    first.learner.close()
+    first.learner.outbox.flush()
+    second = start(run_dir, schedule=ScheduleConfig(l_f=3, gamma_f=1.0))
+    second.live(6 * TICKS + 1, 9 * TICKS)
+    assert windows(second)[2][0] == 8
+    assert any("not as configured now" in text for text in events(second))
+
+
+@pytest.mark.parametrize(("unit", "told"), [(2, (0, 3, 0)), (7, (0, 5, 3))])
+def test_a_window_that_an_order_ends_is_told_as_it_was(
+    run_dir: RunDir, unit: int, told: tuple[int, int, int]
+) -> None:
+    rig = start(run_dir, schedule=ScheduleConfig(kind="explicit", t_m=(0,), g_m=(5,)))
+    rig.live(0, unit * TICKS + 3)
+    assert windows(rig)[0] == (0, 5, None)
+    schedule(rig, kind="fixed", l_f=4, gamma_f=0.5)
+    rig.live(unit * TICKS + 4, unit * TICKS + 7)
+    assert windows(rig) == {0: told}
+    gauges = rig.ledger.stats(0).gauges
+    assert (gauges["schedule/update"], gauges["schedule/hold"]) == told[1:]
+    rig.live(unit * TICKS + 8, (unit + 2) * TICKS)
+    assert windows(rig)[1] == (unit + 1, 2, 2)

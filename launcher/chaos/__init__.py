@@ -1,0 +1,1 @@
+"""`tenuto chaos`: faults on purpose, and whether the run kept its promises."""

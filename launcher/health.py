@@ -1,0 +1,90 @@
+"""`tenuto health`: whether one process's loop turns, as an exit code, for whoever supervises it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from tyro.conf import Positional
+
+from launcher.chaos.faults import Lives
+from launcher.cli import DONE, CommandError
+from launcher.parsing import parse
+from launcher.vitals import START_NS
+from rtcore import channels
+from rtcore.bus import Bus, BusError
+from rtcore.clock import Clock
+from rtcore.config import ConfigError
+from rtcore.monotonic import MonotonicClock
+from rtcore.run_dir import RunDir
+from rtcore.zenoh_bus import open_bus
+
+WAIT_S = 0.25
+
+
+@dataclass(frozen=True)
+class HealthOptions:
+    """Which process of which run."""
+
+    process: Positional[Literal["env_server", "agent_service", "learner", "recorder"]]
+    """The process."""
+    run_dir: Path | None = None
+    """The run directory."""
+    kill_stuck: bool = False
+    """Kill it if it is stuck, so that whoever supervises it starts it again; not in its first 60 s."""
+
+
+def health(argv: Sequence[str]) -> int:
+    """`tenuto health PROCESS`."""
+    description = "Exit with 0 if a process's own loop turns, with 1 if it does not; on its own machine."
+    chosen = parse(HealthOptions, argv, prog="tenuto health", description=description)
+    if chosen.run_dir is None:
+        raise ConfigError("run_dir", None, "must be given")
+    run_dir = RunDir.open(chosen.run_dir)
+    config, clock = run_dir.config(), MonotonicClock()
+    stuck_s = config.supervise.stuck_s
+    try:
+        with open_bus(
+            "client", run_dir.run_name, run_dir.socket_dir(), clock=clock, connect=config.link.connect,
+            secure=config.link.secure,
+        ) as bus:  # fmt: skip
+            age_s = turned(bus, chosen.process, clock, stuck_s)
+    except BusError as error:
+        raise CommandError(str(error)) from error
+    if age_s is None:
+        killed = chosen.kill_stuck and kill(run_dir.path, chosen.process)
+        raise CommandError(
+            f"{chosen.process} has not turned for {stuck_s:g} s" + (" and was killed" if killed else "")
+        )
+    Console().print(f"{chosen.process} turned {age_s:.2f} s ago", highlight=False)
+    return DONE
+
+
+def turned(bus: Bus, process: str, clock: Clock, stuck_s: float) -> float | None:
+    """How many seconds ago a process's loop turned, by its own word; None: not in the last `stuck_s`, and it
+    has been listened to for as long."""
+    stats = bus.queue(channels.STATS, process)
+    begin_ns = clock.now_ns()
+    stuck_ns = round(stuck_s * 1e9)
+    while clock.now_ns() - begin_ns < stuck_ns:
+        stats.wait(WAIT_S)
+        for received in stats.drain():
+            age_ns = clock.now_ns() - received.message.beat_ns
+            if received.message.beat_ns and age_ns <= stuck_ns:
+                return max(0, age_ns) / 1e9
+    return None
+
+
+def kill(run: Path, process: str) -> bool:
+    """Kill it, if it is old enough to have turned; says whether."""
+    life = Lives(run).find(process)
+    if life is None:
+        return False
+    old_enough = life.age_ns() > START_NS
+    if old_enough:
+        life.suffer("kill")
+    life.release()
+    return old_enough

@@ -1,0 +1,36 @@
+"""The command lines of a run's processes: one source for whoever starts them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def process_command(
+    process: str,
+    run: Path,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    router: str = "",
+    supervisor: int | None = None,
+    python: str = sys.executable,
+) -> list[str]:
+    """The command line of one process.
+
+    Args:
+        process: one of `channels.PROCESSES`.
+        run: the run's directory.
+        connect: further endpoints to connect to.
+        listen: further endpoints to listen on.
+        router: endpoint of a Zenoh router to reach the others through, and nothing else.
+        supervisor: number of the process with which it ends.
+        python: the interpreter.
+    """
+    found = [python, "-m", process, "--run", str(run)]
+    for name, endpoints in (("--connect", connect), ("--listen", listen)):
+        for endpoint in endpoints:
+            found += [name, endpoint]
+    found += ["--router", router] if router else []
+    return found + (["--supervised", str(supervisor)] if supervisor is not None else [])

@@ -1,0 +1,83 @@
+"""What a health check makes of what a process says about itself."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from launcher import health
+from rtcore.channels import LEARNER, STATS
+from rtcore.memory_bus import MemoryHub
+from rtcore.monotonic import MonotonicClock
+from tests.launcher.commands import tenuto
+from tests.launcher.ledgers import ledger
+
+S = 1_000_000_000
+STUCK_S = 0.3
+
+
+def listened(beat_ago_s: float | None) -> float | None:
+    """The verdict on a learner whose loop turned so long ago, and who says so all the time."""
+    hub, clock, over = MemoryHub(), MonotonicClock(), threading.Event()
+    bus, speaker = hub.bus("client", clock), hub.bus(LEARNER, clock)
+    stats = speaker.publisher(STATS, LEARNER)
+    beat_ns = 0 if beat_ago_s is None else clock.now_ns() - round(beat_ago_s * S)
+
+    def speak() -> None:
+        while not over.wait(0.02):
+            stats.put(ledger(LEARNER, beat_ns=beat_ns))
+
+    thread = threading.Thread(target=speak)
+    thread.start()
+    try:
+        return health.turned(bus, LEARNER, clock, STUCK_S)
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_loop_that_turned_lately_is_well() -> None:
+    age_s = listened(0.1)
+    assert age_s is not None
+    assert 0.1 <= age_s <= STUCK_S
+
+
+def test_one_that_has_not_is_not_though_its_threads_speak() -> None:
+    assert listened(1.0) is None
+    assert listened(None) is None  # it has only begun
+
+
+def test_who_is_silent_is_not_well() -> None:
+    hub, clock = MemoryHub(), MonotonicClock()
+    assert health.turned(hub.bus("client", clock), LEARNER, clock, 0.1) is None
+
+
+def test_only_a_process_that_had_the_time_to_turn_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "some_role.py").write_text("import time\nprint('up', flush=True)\ntime.sleep(60)\n")
+    command = [sys.executable, "-m", "some_role", "--run", str(tmp_path)]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            assert not health.kill(tmp_path, "some_role")
+            assert process.poll() is None
+            monkeypatch.setattr(health, "START_NS", 0)
+            assert health.kill(tmp_path, "some_role")
+            assert process.wait(5) == -9
+            assert not health.kill(tmp_path, "some_role")
+        finally:
+            process.kill()
+
+
+def test_wrong_input(tmp_path: Path) -> None:
+    missing = tenuto("health", LEARNER, cwd=tmp_path)
+    assert (missing.returncode, missing.stderr) == (2, "tenuto: run_dir = None: must be given\n")
+    nobody = tenuto("health", "nobody", "--run-dir", "x", cwd=tmp_path)
+    assert nobody.returncode == 2
+    assert nobody.stderr.startswith("tenuto: process = 'nobody': one of env_server, agent_service")
