@@ -27,9 +27,8 @@ from rtcore.messages import Action, Command, CommandReply, Step
 from rtcore.pacer import Pacer, Tick
 
 REMEMBERED_TICKS = 64  # sending times kept, so that a late answer's latency is known too
-ACTIONS_KEPT = (
-    64  # between two deadlines there are two, with the rehearsal's, unless this process was stalled
-)
+# Between two deadlines there are two, with the rehearsal's, unless this process was stalled.
+ACTIONS_KEPT = 64
 LONGEST_REST_S = 0.1  # how long the books wait for the answer, and a stop for the books
 LAST_ANSWER_S = 0.1  # how long the end waits for the answer that tells why the last deadline was missed
 

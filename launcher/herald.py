@@ -15,7 +15,7 @@ from rtcore import channels
 from rtcore.bus import Bus
 from rtcore.clock import Clock
 from rtcore.ledger import MAX_TEXT, Ledger
-from rtcore.log_files import JsonLines
+from rtcore.log_files import JsonLines, LineFile
 from rtcore.messages import Event, Level
 from rtcore.process import REPORT_PERIOD_S, Reporter
 
@@ -62,8 +62,8 @@ class Herald:
 @contextmanager
 def logged(path: Path) -> Iterator[None]:
     """Inside the block the launcher's events go to `path`; without that, warnings go to stderr, where its
-    screen is."""
-    lines = logging.FileHandler(path, mode="a", encoding="utf-8", delay=True)  # no file if nothing happens
+    screen is. A disk that is full costs lines, and nothing else."""
+    lines = LineFile(path)  # no file if nothing happens
     lines.setFormatter(JsonLines(channels.LAUNCHER))
     logger = logging.getLogger(channels.LAUNCHER)
     level = logger.level

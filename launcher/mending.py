@@ -5,28 +5,39 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+from launcher.supervisor import Interrupts
+
 LIMIT_S = 20.0
-HURRIED_LIMIT_S = 1.5  # somebody waits for the end
+# Who interrupted waits 5 s for all of it: of the rest, 0.2 s are for the tool to end what it has started,
+# and 0.3 s for the report.
+INTERRUPTED_LIMIT_S = 4.5
+ENDING_S = 0.2
+POLL_S = 0.05
 
 
-def mend(recording: Path, *, hurried: bool) -> bool:
+def mend(recording: Path, interrupts: Interrupts) -> bool:
     """Merge the parts that the recorder's lives left, and repair a torn end; complain if that fails.
 
-    It is the recorder's own tool, in a process of its own: the launcher needs none of its libraries.
+    It is the recorder's own tool, in a process of its own: the launcher needs none of its libraries. It has
+    20 s; once somebody has interrupted, until 4.5 s after that; and if they do it twice, no time at all.
     """
-    if not recording.exists():
-        return False
+    if not any(recording.parent.glob(f"*{recording.stem}*.rrd")):
+        return False  # neither it nor a part of it
     command = [sys.executable, "-m", "recorder.finish", str(recording)]
+    begin_s = time.monotonic()
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, process_group=0
     ) as tool:
-        try:
-            output, _ = tool.communicate(timeout=HURRIED_LIMIT_S if hurried else LIMIT_S)
-        except subprocess.TimeoutExpired:
+        output = None
+        while output is None and not _over(begin_s, interrupts):
+            output = _waited(tool, POLL_S)
+        if output is None:
             tool.send_signal(signal.SIGINT)  # it then ends what it has started itself
-            tool.communicate()
+            if _waited(tool, ENDING_S) is None:
+                tool.kill()
             output = b"it takes too long"
     if tool.returncode == 0:
         return True
@@ -36,3 +47,17 @@ def mend(recording: Path, *, hurried: bool) -> bool:
         f"python -m recorder.finish {recording}\n"
     )
     return False
+
+
+def _over(begin_s: float, interrupts: Interrupts) -> bool:
+    now_s = time.monotonic()
+    late = now_s >= min(begin_s + LIMIT_S, interrupts.first_s + INTERRUPTED_LIMIT_S)
+    return late or interrupts.count > 1
+
+
+def _waited(tool: subprocess.Popen[bytes], timeout_s: float) -> bytes | None:
+    """What it printed, if it ends within the time; called again, all of it."""
+    try:
+        return tool.communicate(timeout=timeout_s)[0]
+    except subprocess.TimeoutExpired:
+        return None

@@ -176,6 +176,8 @@ def _accounts(summary: Summary) -> RenderableType:
         ),
     ]
     found = discrepancies(summary)
+    if foreign := summary["policies"].get("foreign", 0):
+        rows.append(("refused", Text(f"{foreign:,} policies that are not the learner's", style="red")))
     rows.append(("counts", Text("; ".join(found), style="red") if found else "reconcile"))
     if restarts:
         rows.append(("restarts", restarts))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import signal
-from collections import Counter, defaultdict, deque
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
 from typing import Literal
 
+from launcher.vitals import START_NS
 from rtcore.config import SuperviseConfig
 from rtcore.process import WRONG_INPUT
 
@@ -49,18 +50,36 @@ class GiveUp:
     why: str
 
 
+@dataclass
+class _Row:
+    """Deaths in a row.
+
+    Attributes:
+        hows: how each life of it ended.
+        next_s: when the next life begins.
+    """
+
+    hows: list[str] = field(default_factory=list)
+    next_s: float = 0.0
+
+
 class Restarts:
-    """The policy of one run. Each process's deaths count for themselves."""
+    """The policy of one run. Each process's deaths count for themselves.
+
+    It counts deaths in a row, not deaths within a time: lives that each end in a hang last `stuck_s` and
+    more, so that any window holds only a few of them.
+    """
 
     def __init__(self, config: SuperviseConfig) -> None:
         self._config = config
-        self._deaths: defaultdict[str, deque[tuple[float, str]]] = defaultdict(deque)
+        self._rows: defaultdict[str, _Row] = defaultdict(_Row)
 
     def died(self, process: str, now_s: float, code: int, *, hung: bool = False) -> Again | GiveUp:
         """Enter a death and decide.
 
-        The first delay is `first_s`; it doubles with each further death within `within_s`, up to `most_s`.
-        Exit code 2 says that the input is wrong, which no restart changes.
+        The first delay is `first_s`; it doubles with each further death in a row, up to `most_s`. A life that
+        lasted `within_s` ends the row: its own death is the first of another. The time that a hang may have
+        taken does not count as life. Exit code 2 says that the input is wrong, which no restart changes.
 
         Args:
             process: who.
@@ -68,23 +87,28 @@ class Restarts:
             code: its exit code; negative: the signal.
             hung: it was killed for that.
         """
-        deaths = self._deaths[process]
-        deaths.append((now_s, HUNG if hung else describe(code)))
-        while now_s - deaths[0][0] > self._config.within_s:
-            deaths.popleft()
+        lived_s = now_s - self._rows[process].next_s
+        if hung:
+            lived_s -= max(START_NS / 1e9, self._config.stuck_s)
+        if lived_s >= self._config.within_s:
+            del self._rows[process]
+        row = self._rows[process]
+        row.hows.append(HUNG if hung else describe(code))
         if code == WRONG_INPUT:
             return GiveUp(f"cannot work with what it was given ({describe(code)})")
-        if len(deaths) > self._config.limit:
-            return GiveUp(self._why(deaths))
-        doubled = self._config.first_s * 2 ** min(len(deaths) - 1, MOST_DOUBLINGS)
-        return Again(min(doubled, self._config.most_s))
+        if len(row.hows) > self._config.limit:
+            return GiveUp(self._why(row.hows))
+        doubled = self._config.first_s * 2 ** min(len(row.hows) - 1, MOST_DOUBLINGS)
+        delay_s = min(doubled, self._config.most_s)
+        row.next_s = now_s + delay_s
+        return Again(delay_s)
 
-    def _why(self, deaths: deque[tuple[float, str]]) -> str:
-        if len(deaths) == 1:
-            return f"ended unexpectedly ({deaths[0][1]})"
-        counted = Counter(how for _, how in deaths)
-        hows = ", ".join(how if n == 1 else f"{n} x {how}" for how, n in counted.items())
-        return f"died {len(deaths)} times within {self._config.within_s:g} s ({hows})"
+    def _why(self, hows: list[str]) -> str:
+        if len(hows) == 1:
+            return f"ended unexpectedly ({hows[0]})"
+        counted = Counter(hows)
+        each = ", ".join(how if n == 1 else f"{n} x {how}" for how, n in counted.items())
+        return f"died {len(hows)} times in a row ({each})"
 
 
 def describe(code: int) -> str:

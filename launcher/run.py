@@ -70,10 +70,10 @@ def run(argv: Sequence[str]) -> int:
     )
     summary["supervision"] = _told(watch.happenings, run_dir, began_ns)
     summary |= regret.of_run(config, run_dir)
-    write_summary(run_dir, summary)
+    kept = _keep(summary, run_dir)
     console.print(report.render(summary, run_dir))
     _complain(end, run_dir)
-    return FAILED if end.failures or end.forced else DONE
+    return DONE if kept and not end.failures and not end.forced else FAILED
 
 
 def default_path(config: RunConfig) -> Path:
@@ -84,6 +84,16 @@ def default_path(config: RunConfig) -> Path:
 def write_summary(run_dir: RunDir, summary: Summary) -> None:
     """Write summary.json whole."""
     write_atomic(run_dir.summary_path, (json.dumps(summary, indent=2) + "\n").encode())
+
+
+def _keep(summary: Summary, run_dir: RunDir) -> bool:
+    """Write summary.json, or say why not: the report is printed all the same."""
+    try:
+        write_summary(run_dir, summary)
+    except OSError as error:
+        sys.stderr.write(f"tenuto: {run_dir.summary_path} is not written: {error.strerror or error}\n")
+        return False
+    return True
 
 
 def _wanted(config: RunConfig) -> list[str]:
@@ -105,23 +115,24 @@ def _carry_out(
         vitals=lookout.vitals,
         tell=lookout.happened,
     )
-    with interrupts.counted(), supervisor.started():
-        os.nice(NICENESS)
-        with (
-            realtime.out_of_the_way(config.agent.rt),
-            logged(run_dir.log_path(channels.LAUNCHER)),
-            open_bus(
-                "client", run_dir.run_name, run_dir.socket_dir(), clock=clock, secure=config.link.secure
-            ) as bus,
-            closing(viewer),
-            screen.shown(),
-        ):
-            lookout.join(bus)
-            end = supervisor.supervise(interrupts, lookout.look)
-            lookout.look(frozenset())  # the last messages
-    unfinished = channels.RECORDER in wanted and not supervisor.ended_well(channels.RECORDER)
-    if unfinished and end.reason != "killed":
-        mend(run_dir.recording_path, hurried=end.reason == "interrupted")
+    with interrupts.counted():
+        with supervisor.started():
+            os.nice(NICENESS)
+            with (
+                realtime.out_of_the_way(config.agent.rt),
+                logged(run_dir.log_path(channels.LAUNCHER)),
+                open_bus(
+                    "client", run_dir.run_name, run_dir.socket_dir(), clock=clock, secure=config.link.secure
+                ) as bus,
+                closing(viewer),
+                screen.shown(),
+            ):
+                lookout.join(bus)
+                end = supervisor.supervise(interrupts, lookout.look)
+                lookout.look(frozenset())  # the last messages
+        unfinished = channels.RECORDER in wanted and not supervisor.ended_well(channels.RECORDER)
+        if unfinished and end.reason != "killed":
+            mend(run_dir.recording_path, interrupts)
     return end
 
 

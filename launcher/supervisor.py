@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
@@ -58,16 +59,23 @@ class End:
 
 
 class Interrupts:
-    """How often somebody asked for the end."""
+    """How often somebody asked for the end.
+
+    Attributes:
+        count: how often.
+        first_s: when they did for the first time, on the monotonic clock.
+    """
 
     def __init__(self) -> None:
         self.count = 0
+        self.first_s = math.inf
 
     @contextmanager
     def counted(self) -> Iterator[None]:
         """Count SIGINT, SIGTERM and, unless it is ignored as under nohup, SIGHUP inside the block."""
 
         def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signal module's signature
+            self.first_s = min(self.first_s, time.monotonic())
             self.count += 1
 
         numbers = [signal.SIGINT, signal.SIGTERM]

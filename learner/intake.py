@@ -42,7 +42,9 @@ class Intake:
         self._position: Position | None = None  # of what is in the replay
         self._counts: dict[str, int] = dict.fromkeys(COUNTED, 0)  # likewise, of this learner
         self._before: dict[str, int] = {}  # what earlier learners committed
-        self._owed: dict[str, int] = {}  # and were killed before they had counted it
+        # less what they counted: above 0 if one was killed in between; below 0 if one went on in memory, then
+        # what it took in comes again
+        self._owed: dict[str, int] = {}
 
     @property
     def ended(self) -> bool:
@@ -68,7 +70,7 @@ class Intake:
         self._position = place.position
         self._log.go_on_from(place.position)
         self._transitions = Transitions(spec.observation_dim, spec.action_dim, place.previous)
-        self._before = {name: max(place.counts.get(name, 0), counted.get(name, 0)) for name in COUNTED}
+        self._before = {name: place.counts.get(name, 0) for name in COUNTED}
         self._owed = {name: self._before[name] - counted.get(name, 0) for name in COUNTED}
         low, high = np.asarray(spec.action_low), np.asarray(spec.action_high)
         self._middle = ((high + low) / 2).astype(np.float32)
@@ -139,7 +141,7 @@ class Intake:
 
     def _account(self, replay: Replay) -> None:
         for name, count in self._counts.items():
-            self._ledger.set_counter(name, self._owed[name] + count)
+            self._ledger.set_counter(name, max(0, self._owed[name] + count))
         if replay.fault is None:
             return
         if self._ledger.counter("replay.unbacked") == 0:

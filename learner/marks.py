@@ -159,12 +159,9 @@ class Marks:
 def peek(path: Path) -> Record | None:
     """The record that counts in a file of marks of whatever shape; None if it cannot be told."""
     try:
-        data = path.read_bytes()
+        return read(path)
     except OSError:
         return None
-    second = _HEADER_BYTES + max(0, len(data) - _HEADER_BYTES) // 2
-    whole = [found for at in (_HEADER_BYTES, second) if (found := unpack(data[at:])) is not None]
-    return max(whole, key=lambda found: found.generation).record if whole else None
 
 
 def _require(path: Path, header: bytes, wanted: dict[str, int]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from learner import resume
 from learner.algorithm import Algorithm, make_algorithm
@@ -15,6 +16,7 @@ from learner.resume import Budget, Published
 from learner.store import MARKS
 from rtcore.clock import Clock
 from rtcore.config import RunConfig
+from rtcore.files import sweep
 from rtcore.ledger import Ledger
 from rtcore.messages import Spec
 from rtcore.run_dir import RunDir
@@ -61,24 +63,23 @@ def meet(
         found = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
         return found, _place(found.committed)
 
+    for name in ("", resume.REPLAY_DIR, resume.CHECKPOINT_DIR):
+        sweep(run_dir.learner_dir / name)
     directory = run_dir.learner_dir / resume.REPLAY_DIR
-    (replay, place), aside = resume.fitting(load, directory, fresh=fresh, tell=tell)
-    if aside is not None:  # what was learned from it is neither learned again nor lost
-        with suppress(ReplayError):
-            place = _place(peek(aside / MARKS))
+    (replay, place), _ = resume.fitting(load, directory, fresh=fresh, tell=tell)
+    if replay.committed is None or not replay.committed.note:
+        place = _left(directory)
     seed = config.seed * 10 + LEARNER_STREAM
     algorithm = make_algorithm(config, Spaces.of(spec), seed, replay)
     directory = run_dir.learner_dir / resume.CHECKPOINT_DIR
     restored, aside = resume.fitting(
         lambda: resume.restore(run_dir, algorithm), directory, fresh=fresh, tell=tell
     )
-    earned = place.course.earned
-    if aside is not None:
-        budget.resume(len(replay), earned, round(earned))  # an algorithm that starts anew has no arrears
-    elif restored is None:
-        budget.resume(len(replay), earned, 0)
-    else:  # a replay that starts anew has earned nothing yet
-        budget.resume(len(replay), max(earned, restored.earned), restored.spent)
+    saved = restored or resume.Spent()
+    earned = max(place.course.earned, saved.earned)
+    # an algorithm that starts anew has no arrears, and on a replay that does there is nothing to make them up
+    forgiven = aside is not None or len(replay) == 0
+    budget.resume(len(replay), earned, round(earned) if forgiven else saved.spent)
     counted, version = resume.ledgers(run_dir)
     published = resume.published(run_dir, version)
     if restored is not None or len(replay):
@@ -90,6 +91,18 @@ def meet(
     if newest is not None:  # it reaches the disk before anybody gets it
         settled = max(settled, (newest.created_ns - spec.t0_ns) // spec.unit_ns)
     return Beginning(replay, algorithm, place, counted, published, settled)
+
+
+def _left(directory: Path) -> Place:
+    """Where the run stands, for a replay that nothing was committed to: where the one ended that the disk
+    does not give back, or that was set aside last. What came until then is neither learned again nor lost."""
+    for path in (directory, *resume.set_aside(directory)):
+        record = peek(path / MARKS)
+        if record is not None and record.note:
+            with suppress(ReplayError):
+                return _place(record)
+            break
+    return Place()
 
 
 def _place(record: Record | None) -> Place:

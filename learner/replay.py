@@ -95,8 +95,9 @@ class Replay:
 
     @property
     def committed(self) -> Record | None:
-        """What survives the process; None of a replay in memory."""
-        return None if self._store is None else self._store.newest
+        """What survives the process; None of a replay in memory. For any thread."""
+        store = self._store  # read once: the owner may give it up meanwhile
+        return None if store is None else store.newest
 
     @property
     def newest_unit(self) -> int:
@@ -236,10 +237,13 @@ class Replay:
         """Let what was `committed` survive the host as well. For any thread; see `Store.sync`.
 
         Raises:
-            OSError: the disk failed.
+            OSError: the disk failed, now or before.
         """
-        if self._store is not None:
-            self._store.sync(record, last=last)
+        store = self._store  # read once: the owner may give it up meanwhile
+        if store is not None:
+            store.sync(record, last=last)
+        elif self.fault is not None:
+            raise self.fault
 
     def _make_room(self) -> None:
         """Have the files take further rows; without a place on the disk, go on in memory."""

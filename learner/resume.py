@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import count, takewhile
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -94,6 +95,12 @@ def fitting(
         return load(), aside
 
 
+def set_aside(path: Path) -> list[Path]:
+    """Where that which did not fit in `path` is now, the newest first."""
+    names = (path.with_name(f"{path.name}.set-aside-{number}") for number in count(1))
+    return list(takewhile(Path.exists, names))[::-1]
+
+
 def published(run_dir: RunDir, version: int) -> Published:
     """What the run has published, by its newest policy on the disk and by the ledgers' newest `version`."""
     policy = run_dir.read_policy()
@@ -118,7 +125,4 @@ def timetable(run_dir: RunDir) -> bytes | None:
 
 
 def _set_aside(path: Path) -> Path:
-    number = 1
-    while (aside := path.with_name(f"{path.name}.set-aside-{number}")).exists():
-        number += 1
-    return path.rename(aside)
+    return path.rename(path.with_name(f"{path.name}.set-aside-{len(set_aside(path)) + 1}"))

@@ -155,6 +155,7 @@ class LearnerService:
             if learned:
                 self._budget.earn(learned, self._phase)
             self._commit()
+            self._ledger.beat(self._clock.now_ns())  # there may be many
             steps += part
         return steps
 
@@ -184,6 +185,7 @@ class LearnerService:
         found = meeting.meet(
             self._config, self._run_dir, spec, self._budget, self._clock, self._ledger
         )  # or it ends here: what does not fit stays as it is
+        self._ledger.beat(self._clock.now_ns())  # what earlier ones left may take long to load
         self._spec, self._algorithm = spec, found.algorithm
         self._lead_ns = self._lead_floor_ns = min(LEAD_FLOOR_NS, spec.unit_ns // 4)
         self._power.meet(spec.tick_ns, self._clock.now_ns())

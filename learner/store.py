@@ -49,9 +49,8 @@ class Store:
         self._reserve = max(MARGIN, min(capacity // 16, _MOST_RESERVED))
         self._syncing = threading.Lock()
         self._synced = synced
-        self._reserved = (
-            sys.maxsize if synced is None else synced.until
-        )  # nothing to protect before the first
+        # before the first there is nothing to protect
+        self._reserved = sys.maxsize if synced is None else synced.until
         self._backed = 0  # number of the first row that the disk may have no place for
 
     @property

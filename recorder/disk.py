@@ -119,7 +119,8 @@ class RecordingFile:
     def _opened(self) -> int:
         """The new file, after the place says that nothing of it counts yet."""
         earlier = self._earlier
-        self.part = set_aside(self._path, None if earlier is None else (earlier.inode, earlier.length))
+        counts = None if earlier is None else (earlier.inode, earlier.length)
+        self.part = set_aside(self._path, counts) or self.part  # an attempt before this one may have done it
         file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         self._keep_place(file)
         return file

@@ -8,17 +8,27 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
+import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 TIMEOUT_S = 120.0  # measured: 1.3 s for 23 MB in 15 000 chunks, so an hour at 50 Hz stays below 20 s
-# `python -m rerun_cli` (0.41) ends with 0 whatever happened, and `python -m rerun` imports all of rerun.
-CLI = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
+# The program itself: `python -m rerun_cli` (0.41) ends with 0 whatever happened and would stand between us
+# and it, and `python -m rerun` imports all of rerun.
+CLI = (
+    "import os, sys, rerun_cli; tool = os.path.join(os.path.dirname(rerun_cli.__file__), 'rerun'); "
+    "os.execv(tool, [tool, *sys.argv[2:]])"
+)
+# Before that, the kernel is asked to kill it when we die (Linux; 1 is PR_SET_PDEATHSIG, and an exec keeps
+# it): a kill -9 of the recorder must not leave it writing. Too late if we are gone already.
+DIE_WITH_PARENT = (
+    "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); "
+    "os.getppid() == int(sys.argv[1]) or sys.exit('orphaned'); "
+)
 
 MAGIC = b"RRF2"  # begins every recording
 
@@ -63,24 +73,51 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
     Takes in the parts of earlier incarnations, and repairs what a kill -9 left behind: a missing footer,
     a torn last chunk. Killed itself, at any instant, it can be called again.
 
+    Args:
+        recording: the file.
+        timeout_s: for all of it.
+
     Raises:
         FinishError: it did not work; no row is lost, nor there twice.
     """
-    working = recording.with_name(f".{recording.stem}.finishing.rrd")
+    workshop = recording.with_name(f".{recording.stem}.finishing-{os.getpid()}")
+    working = workshop / recording.name
     try:
+        _clear(recording)
         _settle(recording)
         sources = [_checked(path) for path in [*parts_of(recording), recording] if not _empty(path)]
         if not sources:
             raise FinishError(f"{recording.name}: nothing was written")
-        run_cli(["rrd", "optimize", *map(str, sources), "-o", str(working)], timeout_s=timeout_s)
-        run_cli(["rrd", "verify", str(working)], timeout_s=timeout_s)
+        workshop.mkdir()
+        due_s = time.monotonic() + timeout_s
+        optimise = ["rrd", "optimize", *map(str, sources), "-o", str(working)]
+        run_cli(optimise, timeout_s=timeout_s, home_in=workshop)
+        rest_s = max(0.0, due_s - time.monotonic())
+        run_cli(["rrd", "verify", str(working)], timeout_s=rest_s, home_in=workshop)
         working.rename(_finished(recording))
         _settle(recording)
     except OSError as error:
         raise FinishError(f"{recording.name}: {error}") from error
     finally:
-        with suppress(OSError):
-            working.unlink(missing_ok=True)
+        shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _clear(recording: Path) -> None:
+    """Remove what those left who were killed while they finished it."""
+    for workshop in recording.parent.glob(f".{recording.stem}.finishing-*"):
+        pid = int(workshop.name.rpartition("-")[2])
+        if pid == os.getpid() or not _alive(pid):
+            shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # somebody else's
+        pass
+    return True
 
 
 def _finished(recording: Path) -> Path:
@@ -110,11 +147,17 @@ def _checked(path: Path) -> Path:
     return path
 
 
-def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
+def run_cli(arguments: Sequence[str], *, timeout_s: float, home_in: Path | None = None) -> str:
     """Run rerun's command line, with nothing inherited and its usage statistics switched off.
 
     It reads that switch from the user's configuration directory alone, so it gets a home directory of
-    its own for the moment, and the user's is not touched. A Ctrl-C in the terminal does not reach it.
+    its own for the moment, and the user's is not touched. A Ctrl-C in the terminal does not reach it. It dies
+    with the thread that calls this.
+
+    Args:
+        arguments: of the command line.
+        timeout_s: it has so long.
+        home_in: where its home is made; None: where the system keeps such things.
 
     Returns:
         What it printed.
@@ -122,9 +165,10 @@ def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
     Raises:
         FinishError: it failed, or took longer than `timeout_s`.
     """
-    with tempfile.TemporaryDirectory(prefix="tenuto-") as home:
+    where = None if home_in is None else home_in.absolute()
+    with tempfile.TemporaryDirectory(prefix="tenuto-", dir=where) as home:
         switch_off_statistics(Path(home))
-        command = [sys.executable, "-c", CLI, *arguments]
+        command = [sys.executable, "-c", DIE_WITH_PARENT + CLI, str(os.getpid()), *arguments]
         with subprocess.Popen(
             command,
             env={"HOME": home, "NO_COLOR": "1", "RUST_LOG": "warn"},
@@ -136,9 +180,10 @@ def run_cli(arguments: Sequence[str], *, timeout_s: float) -> str:
             try:
                 output, _ = child.communicate(timeout=timeout_s)
             except BaseException as error:
-                os.killpg(child.pid, signal.SIGKILL)  # the Python wrapper and the program behind it
+                child.kill()
                 if isinstance(error, subprocess.TimeoutExpired):
-                    raise FinishError(f"rerun {' '.join(arguments[:2])} took over {timeout_s:g} s") from error
+                    what = f"rerun {' '.join(arguments[:2])} took over {timeout_s:.2g} s"
+                    raise FinishError(what) from error
                 raise
     text = output.decode(errors="replace").strip()
     if child.returncode != 0:

@@ -27,9 +27,8 @@ LIVE_MEMORY = "128MiB"  # what a viewer that joins late still gets; then the old
 # the file waits at most 20 ms, once in 5 s.
 FLUSH_S = 0.02
 RETRY_NS = 5_000_000_000
-ENCODE_S = (
-    5.0  # 0.5 ms for 14 chunks; the threads that encode were seen more than a second behind on busy cores
-)
+# 0.5 ms for 14 chunks; the threads that encode were seen more than a second behind on busy cores.
+ENCODE_S = 5.0
 
 
 class LiveStream:

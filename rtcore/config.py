@@ -261,8 +261,8 @@ class LinkConfig:
 class SuperviseConfig:
     """When a process that died is started again."""
 
-    limit: int = 10  # deaths of one process within `within_s` after which the run is given up
-    within_s: float = 60.0
+    limit: int = 10  # deaths of one process in a row after which the run is given up
+    within_s: float = 60.0  # a life that lasted so long begins the row anew
     first_s: float = 0.1  # from a death to the next start, then twice as long each time
     most_s: float = 5.0  # at most
     stuck_s: float = 8.0  # a process whose loop has not turned for so long is killed and started again

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+_SUFFIX = ".tmp"  # of a file that is not whole yet
 
 
 def write_atomic(path: Path, data: bytes, *, synced: bool = True) -> None:
@@ -52,9 +54,19 @@ def write_once(path: Path, data: bytes) -> None:
     _keep_names(path.parent)
 
 
+def sweep(directory: Path) -> None:
+    """Remove what writers left that were killed while they wrote. Nobody may be writing there now.
+
+    A directory that is not there, or not writable, stays as it is.
+    """
+    with suppress(OSError):
+        for path in directory.glob(f".*{_SUFFIX}"):
+            path.unlink(missing_ok=True)
+
+
 @contextmanager
 def _written_aside(path: Path, data: bytes, *, synced: bool = True) -> Iterator[Path]:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}{_SUFFIX}")
     try:
         with temporary.open("wb") as file:
             file.write(data)

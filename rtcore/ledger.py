@@ -66,13 +66,13 @@ class Ledger:
         snapshot, and no tally, has only some of it.
         """
         with self._lock:
-            counters = self._counters
-            group = {name: counters[name] + 1 for name in names}
+            group = {name: self._counters[name] + 1 for name in names}
             if values:
                 for name, value in values.items():
                     self._check_rises(name, value)
-                group |= values
-            counters |= group
+                group.update(values)
+            for name, value in group.items():  # a Counter's own update adds
+                self._counters[name] = value
             if self._tally is not None:
                 self._tally.set_together(group)
 

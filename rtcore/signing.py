@@ -17,7 +17,7 @@ import msgspec
 from rtcore.channels import LEARNER, PROCESSES
 from rtcore.config import ConfigError, LinkConfig
 from rtcore.messages import Policy
-from rtcore.weights import WeightsError
+from rtcore.weights import WeightsError, sha256
 
 if TYPE_CHECKING:  # 0.09 s to import: only where it is used
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -75,7 +75,7 @@ class NoVerifier:
 
 
 class PolicySigner:
-    """Signs for one run. The weights enter by their hash, which `rtcore.weights.verify` checks."""
+    """Signs for one run. The weights enter by their hash, which who checks the signature checks as well."""
 
     def __init__(self, run_name: str, key: Ed25519PrivateKey) -> None:
         self._run_name = run_name
@@ -104,6 +104,8 @@ class PolicyVerifier:
             self._key.verify(policy.signature, _statement(self._run_name, policy))
         except InvalidSignature as error:
             raise WeightsError("its signature is not the learner's for this run") from error
+        if sha256(policy.weights) != policy.sha256:  # the learner's signature, over others' weights
+            raise WeightsError("sha256 differs")
 
 
 def open_signer(link: LinkConfig, role: str, run_name: str) -> Signer:

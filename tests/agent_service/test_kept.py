@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from agent_service.adoption import NEWEST, Adoption, Past
 from agent_service.kept import Kept
-from launcher.summary import discrepancies, summarise
+from launcher.summary import Summary, discrepancies, summarise
 from rtcore.channels import AGENT, LEARNER
 from rtcore.clock import VirtualClock
 from rtcore.config import RunConfig
 from rtcore.files import write_atomic
 from rtcore.ledger import Ledger
 from rtcore.memory_bus import MemoryHub
-from rtcore.messages import Policy
+from rtcore.messages import Policy, Stats
 from rtcore.run_dir import RunDir
 from rtcore.signing import NoVerifier
 from rtcore.tally import Tally
+from rtcore.weights import WeightsError
 from tests.agent_service.rig import SPEC, Rig, policy, step
 
 
@@ -50,6 +54,14 @@ def offered(rig: Rig, *policies: Policy) -> list[int]:
     return versions
 
 
+def summary_of(published: int, *lives: Stats) -> Summary:
+    """Of a run of that many policies and these lives of the agent."""
+    learner = Ledger(LEARNER, 1)
+    learner.count("published", published)
+    stats = {AGENT: lives, LEARNER: [learner.stats(0, final=True)]}
+    return summarise(RunConfig(), "run", stats, wall_s=0.0, restarts={})
+
+
 def test_the_first_life_has_no_past(run: RunDir) -> None:
     found = past(run)
     assert (found.newest, found.floor) == (None, 0)
@@ -71,6 +83,73 @@ def test_the_newer_of_two_files_is_the_newest(run: RunDir) -> None:
         write_atomic(path, msgspec.msgpack.encode(policy(version)))
     newest = past(run).newest
     assert newest is not None and newest.version == 5
+
+
+class OnlyTo8:
+    """A verifier that knows whose the versions up to 8 are."""
+
+    def check(self, policy: Policy) -> None:
+        if policy.version > 8:
+            raise WeightsError("not the learner's")
+
+
+@pytest.mark.parametrize(("learners", "kept"), [(None, 7), (6, 7), (7, None), (8, None), (9, 7)])
+def test_the_agent_keeps_what_the_learner_has_not_written(
+    run: RunDir, learners: int | None, kept: int | None
+) -> None:
+    """The learner's file may be older than what its bus brought, or nobody's."""
+    if learners is not None:
+        run.policy_path.parent.mkdir(exist_ok=True)
+        write_atomic(run.policy_path, msgspec.msgpack.encode(policy(learners)))
+    ledger = Ledger(AGENT, 1)
+    Kept(run, ledger, VirtualClock(), OnlyTo8()).keep(policy(7))
+    found = run.read_adopted()
+    assert (None if found is None else found.version) == kept
+    assert ledger.counter("policies.foreign") == 0  # nobody wanted to act on it
+
+
+def test_a_file_that_is_not_the_learners_is_in_no_account_of_policies(run: RunDir) -> None:
+    """One is published, and taken; the file at the start claimed to be the ninth."""
+    run.policy_path.parent.mkdir(exist_ok=True)
+    write_atomic(run.policy_path, msgspec.msgpack.encode(policy(9)))
+    rig = Rig(MemoryHub())
+    past = Kept(run, rig.ledger, VirtualClock(), OnlyTo8()).past()
+    assert past.newest is None
+    assert offered(rig, policy(1)) == [1]
+    summary = summary_of(1, rig.ledger.stats(0, final=True))
+    assert discrepancies(summary) == []
+    assert [summary["policies"][name] for name in ("foreign", "rejected", "unreceived")] == [1, 0, 0]
+
+
+class Stages:
+    """Stands for a tally: the counters after each store, as a kill right after it leaves them."""
+
+    def __init__(self) -> None:
+        self.states: list[dict[str, int]] = [{}]
+
+    def set(self, name: str, value: int) -> None:
+        self.states.append({**self.states[-1], name: value})
+
+    def set_together(self, values: Mapping[str, int]) -> None:
+        self.states.append({**self.states[-1], **values})
+
+
+def test_the_fates_of_policies_add_up_wherever_a_life_is_killed() -> None:
+    """Three are published and kept; whenever the first life ends, the next begins with the third."""
+    rig, stages = Rig(MemoryHub()), Stages()
+    rig.ledger._tally = cast("Tally", stages)
+    assert offered(rig, policy(1), policy(2), policy(3)) == [1, 2, 3]
+    assert len(stages.states) > 9
+    first = rig.ledger.stats(0)
+    for counters in stages.states:
+        later = Rig(MemoryHub(), past=Past(newest=policy(3), floor=counters.get(NEWEST, 0)))
+        assert offered(later, policy(3)) == [3]
+        lives = replace(first, counters=counters), replace(later.ledger.stats(0, final=True), incarnation=2)
+        policies = summary_of(3, *lives)["policies"]
+        had = counters.get(NEWEST, 0)
+        assert counters.get("policies.received", 0) == had
+        assert (policies["received_again"], policies["unreceived"]) == (int(had == 3), max(0, 2 - had))
+        assert discrepancies(summary_of(3, *lives)) == []
 
 
 def test_a_policy_older_than_an_earlier_lifes_is_refused() -> None:
@@ -117,12 +196,8 @@ def test_the_fates_of_policies_add_up_over_lives_and_replays() -> None:
     first, second = Rig(MemoryHub()), Rig(MemoryHub(), past=Past(newest=policy(2), floor=2))
     assert offered(first, policy(1), policy(2), policy(1)) == [1, 2, 2]
     assert offered(second, policy(2), policy(1)) == [2, 2]
-    learner = Ledger(LEARNER, 1)
-    learner.count("published", 2)
-    lives = [first.ledger.stats(0, final=True), second.ledger.stats(0, final=True)]
-    lives[1] = msgspec.structs.replace(lives[1], incarnation=2)
-    stats = {AGENT: lives, LEARNER: [learner.stats(0, final=True)]}
-    summary = summarise(RunConfig(), "run", stats, wall_s=0.0, restarts={})
+    later = replace(second.ledger.stats(0, final=True), incarnation=2)
+    summary = summary_of(2, first.ledger.stats(0, final=True), later)
     assert discrepancies(summary) == []
     policies = summary["policies"]
     names = ("published", "adopted", "rejected", "received_again", "unreceived")

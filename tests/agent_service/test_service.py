@@ -10,6 +10,7 @@ import pytest
 
 from agent_service.adoption import Adoption, Past
 from agent_service.inference import UniformPolicy
+from rtcore.histogram import Histogram
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Architecture, Policy
@@ -182,8 +183,35 @@ def test_what_the_verifier_refuses_is_not_adopted(rig: Rig) -> None:
     assert adoption.take() is None
     adoption.offer(policy(2), 0)
     assert adoption.take() is not None
-    counts = [rig.ledger.counter(f"policies.{name}") for name in ("received", "rejected")]
-    assert counts == [2, 1]
+    for version in (1, 3):  # whatever version it claims
+        adoption.offer(policy(version), 0)
+    assert adoption.take() is None
+    counts = [rig.ledger.counter(f"policies.{name}") for name in ("received", "rejected", "foreign")]
+    assert counts == [1, 0, 3]
+
+
+def test_how_old_a_policy_is_at_its_first_swap_is_told_of_new_ones_alone() -> None:
+    """Version 4 comes from the file and 5 is what an earlier life had: not how long a publication takes."""
+    rig = Rig(MemoryHub(), past=Past(newest=policy(4), floor=5))
+    rig.specs.put(SPEC)
+    rig.answer(step(0))
+    rig.policies.put(policy(5))
+    rig.answer(step(1))
+    assert _latencies(rig) == 0
+    rig.policies.put(policy(6))
+    rig.answer(step(2))
+    assert _latencies(rig) == 1
+    assert rig.ledger.counter("policies.adopted") == 2
+
+    rig = Rig(MemoryHub(), past=Past(newest=policy(4)))
+    rig.specs.put(SPEC)
+    answer = rig.answer(step(0))
+    assert answer is not None and answer.policy_version == 4
+    assert _latencies(rig) == 0
+
+
+def _latencies(rig: Rig) -> int:
+    return Histogram.from_bytes(rig.ledger.stats(0).histograms["publish_to_adopt"]).count
 
 
 def test_the_heart_stops_while_an_answer_hangs(rig: Rig) -> None:

@@ -77,3 +77,10 @@ def test_its_log_has_what_happened_and_stderr_has_not(
     assert [(line["level"], line["text"]) for line in lines] == [("WARN", DIED.text), ("INFO", AGAIN.text)]
     assert capsys.readouterr().err == ""
     assert logging.getLogger(LAUNCHER).handlers == []
+
+
+def test_a_full_disk_costs_its_log_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    with logged(Path("/dev/full")):
+        Stage().herald.tell(DIED)
+    assert "No space left on device" in capsys.readouterr().err
+    assert logging.getLogger(LAUNCHER).handlers == []

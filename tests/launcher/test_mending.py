@@ -1,18 +1,24 @@
 from __future__ import annotations
 
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from launcher.mending import mend
+from launcher.mending import INTERRUPTED_LIMIT_S, mend
+from launcher.supervisor import Interrupts
 from recorder import reading
-from recorder.finish import run_cli
+from recorder.finish import run_cli, set_aside
 from tests.recorder.test_finish import killed
 
 
-def test_what_a_killed_recorder_left_is_completed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("parted", [False, True])  # the last life died before it had a file of its own
+def test_what_a_killed_recorder_left_is_completed(parted: bool, tmp_path: Path) -> None:
     path, written = killed(tmp_path, 100)
-    assert mend(path, hurried=False)
+    if parted:
+        set_aside(path)
+    assert mend(path, Interrupts())
     run_cli(["rrd", "verify", str(path)], timeout_s=10)
     assert len(reading.columns(path, "/env/reward")[0]) >= written
 
@@ -21,12 +27,32 @@ def test_what_cannot_be_completed_is_said_with_what_to_do(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "recording.rrd"
-    assert not mend(path, hurried=False)
+    assert not mend(path, Interrupts())
     assert capsys.readouterr().err == ""  # it died before it had a file: nothing to complete
     path.write_bytes(b"something else")
-    assert not mend(path, hurried=False)
+    assert not mend(path, Interrupts())
     assert capsys.readouterr().err == (
         "tenuto: the recording is as the recorder left it (recording.rrd is no recording); to complete it: "
         f"python -m recorder.finish {path}\n"
     )
     assert path.read_bytes() == b"something else"
+
+
+@pytest.mark.parametrize(("count", "ago_s"), [(1, INTERRUPTED_LIMIT_S - 0.5), (2, 0.0)])
+def test_who_interrupts_does_not_wait_even_for_a_tool_that_does_not_end(
+    count: int,
+    ago_s: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    tool, path = tmp_path / "tool", tmp_path / "recording.rrd"
+    tool.write_text("#!/bin/sh\ntrap '' INT\nexec sleep 30\n")
+    tool.chmod(0o755)
+    path.touch()
+    monkeypatch.setattr(sys, "executable", str(tool))
+    interrupts, began_s = Interrupts(), time.monotonic()
+    interrupts.count, interrupts.first_s = count, began_s - ago_s
+    assert not mend(path, interrupts)
+    assert time.monotonic() - began_s < 4.0  # 0.7 s, 0.2 s
+    assert "(it takes too long)" in capsys.readouterr().err

@@ -164,12 +164,13 @@ def test_the_report_fits_one_screen(width: int, tmp_path: Path) -> None:
 
 def test_the_report_says_loudly_what_is_wrong(tmp_path: Path) -> None:
     console, file = console_of(100)
-    env = env_ledger()
+    env, agent = env_ledger(), agent_ledger()
     env.counters["ticks"] = 300
+    agent.counters["policies.foreign"] = 2
     summary = summarise(
         CONFIG,
         "r1",
-        {**whole_run(), ENV_SERVER: [env]},
+        {**whole_run(), ENV_SERVER: [env], AGENT: [agent]},
         wall_s=1.0,
         restarts={LEARNER: 2},
         ended="learner ended unexpectedly (exit code 3)",
@@ -179,6 +180,7 @@ def test_the_report_says_loudly_what_is_wrong(tmp_path: Path) -> None:
     shown = file.getvalue()
     for words in (
         "ticks = produced + resets: 300 != 200",
+        "2 policies that are not the learner's",
         "learner 2",
         "recorder did not end in time",
         "learner ended unexpectedly (exit code 3)",

@@ -59,6 +59,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
             "unused": 0,
             "unreceived": 1,
             "received_again": 0,
+            "foreign": 0,
             "published_in_hold": 0,
             "withheld": 0,
             "last_version": 4,
@@ -191,6 +192,14 @@ def test_policies_reconcile_over_the_lives_of_an_agent() -> None:
         "unreceived": 2,
         "received_again": 2,
     }
+    assert discrepancies(summary) == []
+
+
+def test_policies_of_nobody_are_apart() -> None:
+    learner = ledger(LEARNER, counters={"published": 1})
+    lives = [agent_life(1, final=True, first=1, newest=1, received=1, adopted=1, foreign=2)]
+    summary = summary_of({AGENT: lives, LEARNER: [learner]})
+    assert summary["policies"]["foreign"] == 2
     assert discrepancies(summary) == []
 
 

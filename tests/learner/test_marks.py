@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from learner.marks import Marks, MarksError, Record, pack, unpack
+from learner.marks import Marks, MarksError, Record, pack, peek, unpack
 
 SHAPE = {"schema": 3, "capacity": 4}
 ROOM = 40
@@ -36,6 +36,17 @@ def test_the_newest_comes_back(tmp_path: Path) -> None:
     for number in range(1, 6):
         Marks.open(path, SHAPE, ROOM).write(record(number))
         assert Marks.open(path, SHAPE, ROOM).newest == record(number)
+
+
+def test_anybody_may_look_at_marks_of_whatever_shape(tmp_path: Path) -> None:
+    path = tmp_path / "marks.bin"
+    assert peek(path) is None
+    marks = Marks.open(path, SHAPE, ROOM)
+    for number in range(4):
+        marks.write(record(number))
+        assert peek(path) == record(number)
+    path.write_bytes(path.read_bytes()[:500])
+    assert peek(path) is None
 
 
 def test_cut_off_at_any_byte_there_is_the_new_one_or_the_one_before(tmp_path: Path) -> None:

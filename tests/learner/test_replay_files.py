@@ -225,6 +225,27 @@ def test_a_disk_that_fills_up_leaves_it_in_memory_and_the_files_as_committed(
     assert (held(again), note(again)) == ([1023, 1024, 1025, 1026], b"1026")
 
 
+def test_a_store_that_is_given_up_while_another_thread_looks_is_looked_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class GivenUp:
+        """After the first look."""
+
+        def __get__(self, replay: Replay, kind: type[Replay]) -> store.Store | None:
+            found: store.Store | None = replay.__dict__.get("_store")
+            replay.__dict__["_store"] = None
+            return found
+
+        def __set__(self, replay: Replay, found: store.Store | None) -> None:
+            replay.__dict__["_store"] = found
+
+    monkeypatch.setattr(Replay, "_store", GivenUp(), raising=False)
+    replay = reopened(tmp_path)
+    record = replay.committed
+    assert record is not None
+    reopened(tmp_path).sync(record)
+
+
 def test_a_directory_that_cannot_be_made_leaves_it_in_memory(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     replay = reopened(tmp_path / "file" / "replay")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from learner import checkpoint, outbox
-from learner.columns import MappedColumns
+from learner import checkpoint, meeting, outbox
 from learner.intake import Intake
 from learner.replay import Replay, open_replay
 from rtcore.config import ConfigError, LearnerConfig, RunConfig
@@ -206,93 +203,16 @@ def test_a_replay_that_does_not_fit_is_set_aside_and_the_checkpoint_is_kept(run_
     assert counted(run_dir, "learned") == 33
 
 
-# -- checkpoints while it learns, and a disk that fails
-
-
-def test_a_checkpoint_comes_when_a_unit_ends_and_it_is_time(run_dir: RunDir) -> None:
-    rig, written = start(run_dir, config(checkpoint_s=1.5)), list[int]()
-    for tick in range(60):
-        rig.live(tick, tick)
-        rig.learner.keeper.flush()
-        if rig.ledger.counter("checkpoints") > len(written):
-            written.append(tick)
-    assert written == [10, 30, 50]  # the first at once, then every other unit is over too early
-
-
-def test_while_one_checkpoint_waits_no_other_is_copied(run_dir: RunDir) -> None:
-    rig = start(run_dir)
-    rig.live(0, 59)
-    assert rig.learner.keeper._waiting.qsize() == 1
-    rig.learner.close()
-    rig.learner.keeper.flush()  # what waited is older than the last, and is not written over it
-    saved = checkpoint.load(run_dir.learner_dir / "checkpoint").scalars
-    assert saved["gradient_steps"] == rig.ledger.counter("gradient_steps")
-
-
-def test_a_unit_longer_than_the_period_does_not_put_checkpoints_off(run_dir: RunDir) -> None:
-    rig = start(run_dir, config(checkpoint_s=0.35))
-    written = []
-    for tick in range(9):
-        rig.live(tick, tick)
-        rig.learner.keeper.flush()
-        written.append(rig.ledger.counter("checkpoints"))
-    assert written == [1, 1, 1, 1, 2, 2, 2, 2, 3]
-
-
-def test_a_disk_that_takes_no_checkpoint_is_counted_and_said_once(
+def test_killed_right_after_it_set_a_replay_aside_the_next_goes_on_where_that_one_ended(
     run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, data: bytes) -> None:
-        del path, data
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    rig = start(run_dir)
-    rig.live(0, 10)
-    with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "write_atomic", full)
-        for unit in (1, 2, 3):
-            rig.learner.keeper.flush()
-            rig.live(10 * unit + 1, 10 * unit + 10)
-    rig.learner.keeper.flush()
-    assert (rig.ledger.counter("checkpoint.errors"), rig.ledger.counter("checkpoints")) == (3, 1)
-    assert [text for text in events(rig) if "no checkpoint" in text] == [
-        "no checkpoint: [Errno 28] No space left on device"
-    ]
-
-
-def test_a_disk_that_takes_no_replay_costs_what_comes_then_and_no_more(
-    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(self: MappedColumns, row: int) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    rig = start(run_dir)
-    rig.live(0, 11)
-    rig.learner.keeper.flush()
-    monkeypatch.setattr(MappedColumns, "back", full)
-    store = rig.learner.keeper._replay
-    assert store is not None and store._store is not None
-    store._store._backed = 0  # as if a chunk ended here
-    rig.live(12, 39)
-    rig.learner.close()
-    assert rig.ledger.counter("replay.unbacked") == 28
-    assert rig.ledger.counter("gradient_steps") == 34  # it learns from them all the same
-    assert any("no checkpoint is written any more: [Errno 28]" in text for text in events(rig))
-    monkeypatch.undo()
-    assert held(run_dir).added == 11
-    second = start(run_dir, at=40)
-    second.live(12, 45)  # the checkpoint is none that knows more than the replay
-    assert held(run_dir).added == 45
-
-
-def test_the_checkpoint_is_never_newer_than_the_replay_that_the_disk_has(
-    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """For the case that the host ends: first the rows and their record, then the checkpoint."""
-    order: list[str] = []
-    monkeypatch.setattr(Replay, "sync", lambda self, record, last=False: order.append("replay"))
-    monkeypatch.setattr(checkpoint, "save", lambda directory, state: order.append("checkpoint"))
-    rig = start(run_dir)
-    rig.live(0, 10)
-    rig.learner.keeper.flush()
-    assert order == ["replay", "checkpoint"]
+    """Twice: then the one set aside last has nothing to go on from."""
+    start(run_dir).live(0, 19)
+    for capacity in (500, 400):
+        with monkeypatch.context() as patch:
+            patch.setattr(meeting, "make_algorithm", killed)
+            with pytest.raises(Killed):
+                start(run_dir, config(replay_capacity=capacity, on_mismatch="fresh"), at=20).live(18, 20)
+    start(run_dir, config(replay_capacity=400, on_mismatch="fresh"), at=21).live(10, 31)
+    assert open_replay(run_dir.learner_dir / "replay", 400, 2, 1).added == 12  # 20 to 31
+    assert counted(run_dir, "learned") == 31

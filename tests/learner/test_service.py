@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import pytest
 
+from learner import meeting
+from learner.place import Course
+from learner.store import MARGIN
 from rtcore.config import ConfigError, ScheduleConfig
-from rtcore.messages import Command
+from rtcore.messages import Command, StepBatch
 from rtcore.run_dir import RunDir
 from rtcore.spaces import Spaces
 from rtcore.weights import verify
-from tests.learner.service_rig import CONFIG, SPEC, TICK_NS, UNIT_NS, Rig
+from tests.learner.service_rig import CONFIG, SPEC, TICK_NS, UNIT_NS, Rig, step
 
 
 @pytest.fixture
@@ -128,3 +131,26 @@ def test_after_the_duration_nothing_begins(run_dir: RunDir) -> None:
 def test_an_unknown_order_is_refused(rig: Rig) -> None:
     reply = rig.learner.command(Command(id="1", verb="stop"))
     assert not reply.ok and "stop" in reply.text
+
+
+def test_it_shows_that_it_lives_within_a_turn_that_takes_long(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A checkpoint that takes 7 s to load, then three parts of a backlog, of which each takes 5 s."""
+    meet, commit, beats = meeting.meet, rig.learner._intake.commit, list[float]()
+
+    def slow_meet(*given: object) -> meeting.Beginning:
+        rig.clock.advance_ns(7_000_000_000)
+        return meet(*given)  # type: ignore[arg-type]
+
+    def slow_commit(course: Course) -> None:
+        rig.clock.advance_ns(5_000_000_000)
+        commit(course)
+
+    monkeypatch.setattr(meeting, "meet", slow_meet)
+    monkeypatch.setattr(rig.learner._intake, "commit", slow_commit)
+    monkeypatch.setattr(rig.ledger, "beat", lambda now_ns: beats.append(now_ns / 1e9))
+    rig.clock.sleep_until_ns(300_000_000_000)
+    rig.log.put(StepBatch(steps=[step(seq, reset=seq == 0) for seq in range(2 * MARGIN + 1)]))
+    rig.learner._take_in()
+    assert beats == [307, 317, 322, 327]  # it commits once when it has met the world

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rerun as rr
@@ -185,6 +188,26 @@ def test_a_new_file_counts_for_nothing_before_its_first_place(
     assert third.append(b"c" * 10, Place(log=(1, 2)))
     assert path.read_bytes() == b"c" * 10
     assert [part.read_bytes() for part in parts_of(path)] == [b"a" * 10]
+
+
+def test_where_earlier_lives_left_theirs_is_known_though_the_disk_refused_the_new_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, clock = tmp_path / "recording.rrd", VirtualClock()
+    path.write_bytes(b"a" * 10)
+    file, opened = RecordingFile(path, tmp_path / "place", clock), os.open
+
+    def full(*arguments: Any) -> int:
+        monkeypatch.setattr("recorder.disk.os.open", opened)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("recorder.disk.os.open", full)
+    assert not file.append(b"b" * 10, Place())
+    clock.advance_ns(RETRY_NS)
+    assert file.append(b"c" * 10, Place())
+    file.close()
+    assert file.part == tmp_path / "recording.part000.rrd"
+    assert (file.part.read_bytes(), path.read_bytes()) == (b"a" * 10, b"c" * 10)
 
 
 def test_without_a_place_it_records_and_says_what_that_may_cost(tmp_path: Path) -> None:

@@ -7,12 +7,17 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
 from recorder import finish, reading
 from recorder.finish import FinishError, run_cli
+
+T = TypeVar("T")
 
 CHILD = """
 import sys
@@ -83,6 +88,68 @@ def test_too_slow_is_a_failure_and_leaves_nothing_running(
     assert left.stdout == ""
 
 
+def test_the_tool_dies_with_a_recorder_that_is_killed(tmp_path: Path) -> None:
+    pipe = tmp_path / "never"
+    os.mkfifo(pipe)  # it waits for somebody who writes
+    code = f"from recorder.finish import run_cli; run_cli(['rrd', 'verify', {str(pipe)!r}], timeout_s=60)"
+    with subprocess.Popen([sys.executable, "-c", code], env={"TMPDIR": str(tmp_path)}) as recorder:
+        tool = until(lambda: child_of(recorder.pid, "rerun"))
+        recorder.kill()
+    until(lambda: not alive(tool))
+
+
+def until(look: Callable[[], T]) -> T:
+    limit_s = time.monotonic() + 20
+    while not (found := look()):
+        assert time.monotonic() < limit_s
+        time.sleep(0.02)
+    return found
+
+
+def child_of(pid: int, name: str) -> int:
+    found = subprocess.run(["pgrep", "-x", "-P", str(pid), name], capture_output=True, check=False)
+    return int(found.stdout or 0)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
+    except FileNotFoundError:
+        return False
+
+
+def test_what_a_killed_finish_left_is_removed_and_what_another_is_at_is_not(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    for pid in (ended.pid, os.getpid(), os.getppid()):
+        workshop = tmp_path / f".recording.finishing-{pid}"
+        workshop.mkdir()
+        (workshop / "recording.rrd").write_text("half of it")
+    with pytest.raises(FinishError, match="nothing was written"):
+        finish.finish(tmp_path / "recording.rrd")
+    assert [left.name for left in tmp_path.iterdir()] == [f".recording.finishing-{os.getppid()}"]
+
+
+def test_the_time_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[float] = []
+
+    def slow(arguments: Sequence[str], *, timeout_s: float, home_in: Path) -> str:
+        assert home_in.parent == tmp_path
+        given.append(timeout_s)
+        time.sleep(0.2)
+        (home_in / "recording.rrd").write_bytes(finish.MAGIC)
+        return ""
+
+    monkeypatch.setattr(finish, "run_cli", slow)
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(finish.MAGIC)
+    finish.finish(path, timeout_s=5.0)
+    finish.finish(path, timeout_s=0.1)
+    assert given[0] == 5.0 and 0.0 < given[1] <= 4.8
+    assert given[2:] == [0.1, 0.0]
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_parts_are_numbered_and_kept_until_they_are_taken_in(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     assert finish.set_aside(path) is None
@@ -106,6 +173,11 @@ def test_usage_statistics_are_off_and_the_users_settings_are_not_touched(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    settings = run_cli(["analytics", "config"], timeout_s=10)
-    assert json.loads(settings[settings.index("{") :])["analytics_enabled"] is False
+    monkeypatch.chdir(tmp_path.parent)
+    Path("homes").mkdir(exist_ok=True)
+    for home_in in (None, Path("homes")):  # a relative one is no use to the tool
+        settings = run_cli(["analytics", "config"], timeout_s=10, home_in=home_in)
+        found = json.loads(settings[settings.index("{") :])
+        assert found["analytics_enabled"] is False
+        assert Path(found["config_file_path"]).is_absolute()
     assert list(tmp_path.iterdir()) == []

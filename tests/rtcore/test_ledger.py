@@ -64,6 +64,16 @@ def test_counters_do_not_fall() -> None:
     assert ledger.stats(1).counters == {"messages.rejected": 3}
 
 
+def test_a_group_adds_and_takes_over_and_none_of_it_falls() -> None:
+    ledger = Ledger("agent_service", 1)
+    ledger.count("never", 0)
+    ledger.count_together("received", values={"first": 4, "newest": 4})
+    ledger.count_together("received", values={"first": 4, "newest": 6})
+    with pytest.raises(ValueError, match=r"newest: 5 after 6"):
+        ledger.count_together("received", values={"newest": 5})
+    assert ledger.stats(1).counters == {"never": 0, "received": 2, "first": 4, "newest": 6}
+
+
 def test_gauges_keep_the_newest_value() -> None:
     ledger = Ledger("learner", 1)
     ledger.gauge("alpha", 0.2)

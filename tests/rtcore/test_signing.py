@@ -15,7 +15,7 @@ from rtcore import channels
 from rtcore.config import ConfigError, LinkConfig
 from rtcore.messages import Policy
 from rtcore.signing import ROLES, identity, open_signer, open_verifier
-from rtcore.weights import WeightsError
+from rtcore.weights import WeightsError, sha256
 from tests.rtcore.bus_samples import policy
 
 NOW = datetime.now(UTC)
@@ -35,7 +35,13 @@ def copied(home: Path, tmp_path: Path) -> Path:
 
 
 def signed(home: Path, run: str = "run", version: int = 4) -> Policy:
-    return open_signer(LinkConfig(secure=str(home)), channels.LEARNER, run).sign(policy(version))
+    return open_signer(LinkConfig(secure=str(home)), channels.LEARNER, run).sign(whole(version))
+
+
+def whole(version: int) -> Policy:
+    """With the hash of its weights."""
+    plain = policy(version)
+    return replace(plain, sha256=sha256(plain.weights))
 
 
 def test_without_security_a_policy_passes_as_it_is() -> None:
@@ -47,7 +53,7 @@ def test_without_security_a_policy_passes_as_it_is() -> None:
 
 def test_what_the_learner_signs_everybody_can_check(home: Path) -> None:
     one = signed(home)
-    assert replace(one, signature=b"") == policy(4)
+    assert replace(one, signature=b"") == whole(4)
     for role in ROLES:
         open_verifier(LinkConfig(secure=str(home)), role, "run").check(one)
 
@@ -73,6 +79,12 @@ def test_a_changed_policy_is_nobodys(home: Path, change: dict[str, Any]) -> None
     verifier = open_verifier(LinkConfig(secure=str(home)), channels.AGENT, "run")
     with pytest.raises(WeightsError, match=r"it is not signed|its signature is not the learner's"):
         verifier.check(replace(signed(home), **change))
+
+
+def test_other_weights_below_the_learners_signature_are_nobodys(home: Path) -> None:
+    verifier = open_verifier(LinkConfig(secure=str(home)), channels.AGENT, "run")
+    with pytest.raises(WeightsError, match="sha256 differs"):
+        verifier.check(replace(signed(home), weights=b"others"))
 
 
 def test_a_signature_is_for_one_run_and_by_one_key(home: Path, tmp_path: Path) -> None:

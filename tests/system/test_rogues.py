@@ -8,7 +8,9 @@ from rtcore import channels
 from tests.system.rogues import ROGUES, Traces, play, tampered_file
 
 ENV_DENIED, AGENT_DENIED = (f"{process}.link.denied" for process in (channels.ENV_SERVER, channels.AGENT))
-REJECTED, RECEIVED = (f"{channels.AGENT}.policies.{what}" for what in ("rejected", "received"))
+REJECTED, RECEIVED, FOREIGN = (
+    f"{channels.AGENT}.policies.{what}" for what in ("rejected", "received", "foreign")
+)
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +21,7 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Traces]:
 def test_the_honest_ones_are_refused_nothing(traces: dict[str, Traces]) -> None:
     counted = traces["nobody"].counted
     assert counted["env_server.ticks"] > 5
-    assert not [name for name in counted if ".link." in name or "rejected" in name]
+    assert not [name for name in counted if ".link." in name or name.endswith(("rejected", "foreign"))]
 
 
 @pytest.mark.parametrize("rogue", [rogue.__name__ for rogue in ROGUES if rogue is not tampered_file])
@@ -43,14 +45,14 @@ def test_who_has_no_certificate_of_ours_gets_no_link(
     assert found.counted["env_server.link.refused"] > 0
     assert found.counted["agent_service.link.refused"] > 0
     assert f"link refused: {text}" in found.told
-    assert found.counted[RECEIVED] == 0
+    assert found.counted[RECEIVED] == found.counted[FOREIGN] == 0
 
 
 def test_each_policy_of_a_recorder_is_counted(traces: dict[str, Traces]) -> None:
     found = traces["recorder_publishes"]
     assert found.counted[AGENT_DENIED] >= found.returned
     assert "message refused: recorder may not Put (ingress) on tenuto/run/policy" in found.told
-    assert found.counted[RECEIVED] == 0
+    assert found.counted[RECEIVED] == found.counted[FOREIGN] == 0
 
 
 def test_each_action_of_a_recorder_is_counted(traces: dict[str, Traces]) -> None:
@@ -72,16 +74,24 @@ def test_an_order_of_a_recorder_is_counted(traces: dict[str, Traces]) -> None:
     [
         ("unsigned", "policy 9 refused: it is not signed"),
         ("other_weights", "policy 9 refused: its signature is not the learner's"),
-        ("same_hash_claimed", "policy 9 refused: "),
+        ("same_hash_claimed", "policy 9 refused: sha256 differs"),
         ("another_run", "policy 9 refused: its signature is not the learner's"),
-        ("replayed", "policy 1 refused: version 3 was there before"),
-        ("replayed_to_a_new_agent", "policy 2 refused: version 3 was there before"),
         ("tampered_file", "policy 9 from a file refused: its signature is not the learner's"),
     ],
 )
-def test_each_policy_that_is_not_the_learners_newest_is_counted(
+def test_each_policy_that_is_not_the_learners_is_counted_apart(
     traces: dict[str, Traces], rogue: str, why: str
 ) -> None:
-    assert traces[rogue].counted[REJECTED] == 1
+    counted = traces[rogue].counted
+    assert (counted[FOREIGN], counted[RECEIVED], counted[REJECTED]) == (1, 0, 0)
     assert why in traces[rogue].told
     assert 9 not in traces[rogue].versions
+
+
+@pytest.mark.parametrize(("rogue", "version"), [("replayed", 1), ("replayed_to_a_new_agent", 2)])
+def test_each_policy_of_the_learners_past_is_counted(
+    traces: dict[str, Traces], rogue: str, version: int
+) -> None:
+    counted = traces[rogue].counted
+    assert (counted[REJECTED], counted[f"{channels.AGENT}.policies.past"], counted[FOREIGN]) == (1, 1, 0)
+    assert f"policy {version} refused: version 3 was there before" in traces[rogue].told
