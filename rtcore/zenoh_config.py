@@ -99,16 +99,7 @@ def session_config(
             "timeout_ms": 0,
             "exit_on_failure": True,  # a socket in use: the process runs already
         },
-        "connect": {
-            "endpoints": [*(_endpoint(socket_dir, name, security) for name in earlier), *connect],
-            "timeout_ms": -1,  # retry for ever; 0 would mean once
-            "exit_on_failure": False,
-            "retry": {
-                "period_init_ms": RETRY_FIRST_MS,
-                "period_max_ms": RETRY_MOST_MS,
-                "period_increase_factor": 2,
-            },
-        },
+        "connect": _connecting([*(_endpoint(socket_dir, name, security) for name in earlier), *connect]),
         # Without connect_scouted a restarted reader asks for history before it is connected, and gets none.
         "open": {"return_conditions": {"connect_scouted": True, "declares": True}},
         "scouting": {
@@ -119,6 +110,19 @@ def session_config(
         "queries_default_timeout": 2000,
         "transport": _transport(protocols, security),
     } | secured
+
+
+def _connecting(endpoints: list[str]) -> dict[str, object]:
+    return {
+        "endpoints": endpoints,
+        "timeout_ms": -1,  # retry for ever; 0 would mean once
+        "exit_on_failure": False,
+        "retry": {
+            "period_init_ms": RETRY_FIRST_MS,
+            "period_max_ms": RETRY_MOST_MS,
+            "period_increase_factor": 2,
+        },
+    }
 
 
 def require_tls(endpoints: Sequence[str]) -> None:
