@@ -22,8 +22,12 @@ from rtcore.weights import WeightsError
 class Kept:
     """Two files: the learner's, where it is on this host, and otherwise the agent's own."""
 
-    def __init__(self, run_dir: RunDir, ledger: Ledger, clock: Clock, verifier: Verifier) -> None:
+    def __init__(
+        self, run_dir: RunDir, ledger: Ledger, clock: Clock, verifier: Verifier, agent: str = channels.AGENT
+    ) -> None:
+        """`agent` is the process's name."""
         self._run_dir = run_dir
+        self._agent = agent
         self._ledger = ledger
         self._clock = clock
         self._verifier = verifier
@@ -34,7 +38,7 @@ class Kept:
 
     def floor(self) -> int:
         """The newest version that an earlier life of the agent took; 0: none did."""
-        tallies = self._run_dir.logs_dir.glob(f"{channels.AGENT}-*.tally")
+        tallies = self._run_dir.logs_dir.glob(f"{self._agent}-*.tally")
         for path in sorted(tallies, key=lambda path: (len(path.name), path.name), reverse=True):
             try:
                 version = tally.read(path).get(NEWEST, 0)
@@ -47,7 +51,7 @@ class Kept:
 
     def newest(self) -> Policy | None:
         """The newest one whose signature is right; another is refused, counted and reported."""
-        found = (self._run_dir.read_policy(), self._run_dir.read_adopted())
+        found = (self._run_dir.read_policy(), self._run_dir.read_adopted(self._agent))
         good = [policy for policy in found if policy is not None and self._is_right(policy)]
         return max(good, key=lambda policy: policy.version, default=None)
 
@@ -59,7 +63,7 @@ class Kept:
         learners = self._run_dir.read_policy()
         if learners is not None and learners.version >= policy.version and self._flaw(learners) is None:
             return
-        path = self._run_dir.adopted_path
+        path = self._run_dir.adopted_path(self._agent)
         try:
             path.parent.mkdir(exist_ok=True)
             write_atomic(path, msgspec.msgpack.encode(policy))

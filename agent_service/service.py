@@ -49,9 +49,11 @@ class AgentService:
         past: Past | None = None,
         evidence: Evidence | None = None,
         verifier: Verifier | None = None,
+        *,
+        number: int = 0,
     ) -> None:
         """`past` is what earlier lives leave to this one; `verifier` checks who signed a policy, None: nobody
-        does.
+        does; `number` is of its environment in a fleet, which explores apart from the others.
         """
         self._past = past or Past()
         self._last_published = self._past.newest
@@ -62,7 +64,7 @@ class AgentService:
         self._clock = clock
         self._verifier = verifier
         self._ledger = ledger
-        self._rng = np.random.default_rng([config.seed, AGENT_STREAM])
+        self._rng = np.random.default_rng([config.seed, AGENT_STREAM, number])  # a last 0 changes nothing
         self._specs = bus.queue(channels.SPEC, name, capacity=MAX_DECLARED)
         self._policies = bus.queue(channels.POLICY, capacity=64)
         self._actions = bus.publisher(channels.ACTION, name)

@@ -112,7 +112,7 @@ class Stage:
         time.sleep(SETTLE_S)
         self.kill()
         if self._arm == "bus":
-            self._run_dir.adopted_path.unlink(missing_ok=True)
+            self._run_dir.adopted_path(channels.AGENT).unlink(missing_ok=True)
         time.sleep(SETTLE_S)
         self._answers.read(0.1)
         skipped, self._answers.skipped = self._answers.skipped, 0

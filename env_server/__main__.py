@@ -16,7 +16,8 @@ def serve(process: Process) -> None:
     """Make the world, tick, close."""
     config, bus, stop = process.config, process.bus, process.stop
     with closing(make_world(config.env, config.seed)) as world:
-        world.save_scene(process.run_dir.world_path)
+        if process.part.number == 0:  # a fleet's worlds look alike
+            world.save_scene(process.run_dir.world_path)
         service = EnvService(
             config,
             world,
@@ -24,11 +25,11 @@ def serve(process: Process) -> None:
             process.clock,
             process.ledger,
             process.incarnation,
-            past=Past(process.run_dir),
+            past=Past(process.run_dir, part=process.part),
             resumed_ns=process.continuations.all_ns,
         )
-        bus.serve(channels.ENV_SERVER, lambda command: service.command(command, stop))
-        bus.declare_alive(channels.ENV_SERVER)
+        bus.serve(process.name, lambda command: service.command(command, stop))
+        bus.declare_alive(process.name)
         with background(service.journal.run, name="journal", ends=process.stop):
             try:
                 service.run(stop)

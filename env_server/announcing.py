@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from rtcore import channels, epoch
+from rtcore import cast, channels, epoch
 from rtcore.bus import Bus
+from rtcore.cast import Part
 from rtcore.clock import Clock
 from rtcore.config import RunConfig
 from rtcore.epoch import Epoch
@@ -20,10 +21,12 @@ from rtcore.lifecycle import Stop
 from rtcore.run_dir import RunDir
 
 LEAD_NS = 100_000_000  # from announcing to the first tick, so that the spec is with everybody before step 0
-PEERS = frozenset({channels.AGENT, channels.LEARNER})  # whom T0 waits for in any case
+# The env servers of a fleet see each other come within a poll: who proposes T0 leaves the others the time.
+FLEET_LEAD_NS = 300_000_000
 PEERS_POLL_S = 0.05
 # A later life finds the run's clock running: it waits as long as links need to come back, 1.2 s at worst.
 RETURN_WAIT_S = 1.2
+ALONE = Part(channels.ENV_SERVER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +36,12 @@ class Past:
     Attributes:
         run_dir: what they left; None: there are none, and none will follow.
         wall_ns: Unix time.
+        part: which env server of the run this is.
     """
 
     run_dir: RunDir | None = None
     wall_ns: Callable[[], int] = time.time_ns
+    part: Part = ALONE
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +64,13 @@ class Beginning:
 
 
 def wait_for_peers(config: RunConfig, past: Past, bus: Bus, clock: Clock, ledger: Ledger, stop: Stop) -> None:
-    """Wait until agent and learner are there, and the recorder of a run that is recorded: whoever comes later
-    finds only the newest policy. `env.start_wait_s` at most, and where the run has begun already 1.2 s.
+    """Wait until all other processes of the run are there: whoever comes later finds only the newest policy.
+    `env.start_wait_s` at most, and where the run has begun already 1.2 s.
     """
     wait_s, run_dir = config.env.start_wait_s, past.run_dir
     if run_dir is not None and epoch.read(run_dir.epoch_path) is not None:
         wait_s = min(wait_s, RETURN_WAIT_S)
-    peers = PEERS | ({channels.RECORDER} if config.recorder.record else set())
+    peers = {*cast.names(config, record=config.recorder.record)} - {past.part.name}
     limit_ns = clock.now_ns() + round(wait_s * 1e9)
     while missing := peers - bus.alive():
         now_ns = clock.now_ns()
@@ -88,23 +93,36 @@ def begin(config: RunConfig, past: Past, clock: Clock, ledger: Ledger, *, tick_n
     end_index = num_ticks if config.duration_s > 0 else None
     run_dir, now_ns, unix_ns = past.run_dir, clock.now_ns(), past.wall_ns()
     boot_id = "" if run_dir is None else epoch.this_boot()
-    proposed = Epoch(t0_ns=now_ns + LEAD_NS, wall_t0_ns=unix_ns + LEAD_NS, boot_id=boot_id)
+    process, alone = past.part.name, past.part.index is None
+    lead_ns = LEAD_NS if alone else FLEET_LEAD_NS
+    proposed = Epoch(t0_ns=now_ns + lead_ns, wall_t0_ns=unix_ns + lead_ns, boot_id=boot_id)
     if run_dir is None:
-        return Beginning(proposed, 0, end_index)
-    settled, problem = epoch.settle(run_dir.epoch_path, proposed, now_ns=now_ns, wall_ns=unix_ns)
+        return Beginning(shifted(proposed, config, past.part, tick_ns), 0, end_index)
+    if not alone:  # T0 is one for all
+        agreed, _ = epoch.agree(run_dir.epoch_path, proposed, now_ns=now_ns, wall_ns=unix_ns)
+        proposed = shifted(agreed, config, past.part, tick_ns)
+    settled, problem = epoch.settle(run_dir.lives_path(process), proposed, now_ns=now_ns, wall_ns=unix_ns)
     if problem is not None:
         text = f"the run's beginning is not on disk ({problem}): a later env server would begin anew"
         ledger.event(now_ns, "WARN", text)
-    if settled.lives == 1:
+    if settled.lives == 1 and alone:  # of a fleet's, another one may have begun
         return Beginning(settled, 0, end_index)
-    lives = [stats.counters for stats in run_dir.read_final_stats() if stats.process == channels.ENV_SERVER]
+    lives = [stats.counters for stats in run_dir.read_final_stats() if stats.process == process]
     return go_on(settled, lives, now_ns=clock.now_ns(), tick_ns=tick_ns, end_index=end_index)
+
+
+def shifted(agreed: Epoch, config: RunConfig, part: Part, tick_ns: int) -> Epoch:
+    """The beginning as this environment of a fleet keeps it: the deadlines of all are spread evenly over a
+    period, so that they do not all want the same core at once."""
+    offset_ns = part.number * tick_ns // config.env.count
+    return replace(agreed, t0_ns=agreed.t0_ns + offset_ns, wall_t0_ns=agreed.wall_t0_ns + offset_ns)
 
 
 def go_on(
     settled: Epoch, lives: Sequence[Mapping[str, int]], *, now_ns: int, tick_ns: int, end_index: int | None
 ) -> Beginning:
-    """Where a later life begins, at the first deadline at or after `now_ns` and the lead. Pure.
+    """Where a life begins that finds the run begun: at the first deadline at or after `now_ns` and the lead.
+    Pure.
 
     Args:
         settled: when the run began.

@@ -26,12 +26,13 @@ LEAD_SHARE, LONGEST_LEAD_NS = 0.4, 1_200_000
 class Rehearsal:
     """Sends rehearsals; the agent answers them like steps, and the env server ignores the answers."""
 
-    def __init__(self, steps: Publisher[Step], clock: Clock, tick_ns: int) -> None:
+    def __init__(self, steps: Publisher[Step], clock: Clock, tick_ns: int, *, fleet: bool = False) -> None:
+        """`fleet`: other pairs of env server and agent keep the core busy, and need it."""
         self._steps = steps
         self._clock = clock
         self._tick_ns = tick_ns
         self._lead_ns = round(min(LEAD_SHARE * tick_ns, LONGEST_LEAD_NS))
-        self.wanted = SHORTEST_TICK_NS <= tick_ns <= LONGEST_TICK_NS
+        self.wanted = not fleet and SHORTEST_TICK_NS <= tick_ns <= LONGEST_TICK_NS
 
     def perform(self, step: Step) -> bool:
         """Wait for the moment before the deadline that follows `step`, and send it once more.

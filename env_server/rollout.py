@@ -56,14 +56,23 @@ class Rollout:
     """Turns a world through its episodes, tick by tick."""
 
     def __init__(
-        self, world: World, actuation: Actuation, *, episode_steps: int, seed: int, notify: Notify = "none"
+        self,
+        world: World,
+        actuation: Actuation,
+        *,
+        episode_steps: int,
+        seed: int,
+        number: int = 0,
+        notify: Notify = "none",
     ) -> None:
-        """Episodes are numbered from 0, or from what `go_on_from` says before the first turn."""
+        """Episodes are numbered from 0, or from what `go_on_from` says before the first turn; `number` is of
+        the environment in a fleet, whose episodes start apart from the others'."""
         self._world = world
         self._notify = notify
         self._actuation = actuation
         self._episode_steps = episode_steps
         self._seed = seed
+        self._number = number
         self._episode = -1
         self._episode_tick = 0
         self._return = 0.0
@@ -111,11 +120,13 @@ class Rollout:
         return self._actuation.answers(message, expected_tick)
 
     def _reset(self, newest: Action | None, t: int) -> Turn:
-        """Begin an episode whose start follows from the run's seed and the episode's index alone."""
+        """Begin an episode whose start follows from the seed, the environment's number and the episode's."""
         self._episode += 1
         self._episode_tick = 0
         self._return = 0.0
-        seeds = np.random.SeedSequence([self._seed, WORLD_STREAM, self._episode])
+        seeds = np.random.SeedSequence(
+            [self._seed, WORLD_STREAM, self._episode, self._number]
+        )  # of 0 the same
         observation = self._world.reset(int(seeds.generate_state(1)[0]), t)
         verdict = self._actuation.reset(newest)
         self._ended = broken = not np.isfinite(observation).all()

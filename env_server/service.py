@@ -79,8 +79,9 @@ class EnvService:
         past: Past | None = None,
         resumed_ns: Callable[[], Sequence[int]] = tuple,
     ) -> None:
-        """`config.env` is resolved (`worlds.resolve`), `world` is its world, `past` tells when the run began,
-        `resumed_ns` gives the instants at which this process was continued after a stop.
+        """`config.env` is resolved (`worlds.resolve`), `world` is its world, `past` tells which env server of
+        the run this is and when the run began, `resumed_ns` gives the instants at which this process was
+        continued after a stop.
         """
         env = config.env
         self._config = config
@@ -94,7 +95,12 @@ class EnvService:
         self._unit_ns = unit_ns(env)
         rules = Rules.of(env, world, incarnation=incarnation)
         self._rollout = Rollout(
-            world, Actuation(rules), episode_steps=env.episode_steps, seed=config.seed, notify=env.notify
+            world,
+            Actuation(rules),
+            episode_steps=env.episode_steps,
+            seed=config.seed,
+            number=self._past.part.number,
+            notify=env.notify,
         )
         self._specs = bus.publisher(channels.SPEC, env.name)
         self._steps = bus.publisher(channels.STEP, env.name)
@@ -102,7 +108,7 @@ class EnvService:
         self.journal = Journal(bus.publisher(channels.LOG, env.name), clock, ledger)
         self._heard: list[Received[Action]] = []
         self._accounts = Accounts(ledger)
-        self._rehearsal = Rehearsal(self._steps, clock, self._tick_ns)
+        self._rehearsal = Rehearsal(self._steps, clock, self._tick_ns, fleet=env.count > 1)
         self._blame = Blame(self._tick_ns, resumed_ns)
         self._observed: deque[Observed] = deque(maxlen=REMEMBERED_TICKS)
         self._seq = 0
@@ -163,7 +169,7 @@ class EnvService:
         self._specs.put(spec)
         speed = "" if env.speed is None else f", {env.speed:g} times native speed"
         text = f"{env.id} at {1e9 / self._tick_ns:g} Hz{speed}"
-        if epoch.lives > 1:
+        if epoch.lives > 1 or beginning.first_index > 0:
             text += f"; goes on at tick {beginning.first_index}, {beginning.down} passed meanwhile"
         self._ledger.event(self._clock.now_ns(), "INFO", text)
 

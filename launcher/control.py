@@ -17,7 +17,7 @@ from launcher.cli import DONE, CommandError
 from launcher.parsing import parse
 from launcher.run import RUNS
 from learner.schedule.timetable import require_constants
-from rtcore import channels
+from rtcore import cast, channels
 from rtcore.bus import Bus, BusError, NoAnswerError
 from rtcore.config import ConfigError, ScheduleConfig
 from rtcore.config_check import check
@@ -25,6 +25,7 @@ from rtcore.messages import Command, CommandReply
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir, latest
 from rtcore.zenoh_bus import open_bus
+from rtcore.zenoh_config import Endpoints
 
 Verb = Literal["hold", "resume", "status", "stop", "schedule"]
 
@@ -51,7 +52,7 @@ def status(argv: Sequence[str]) -> int:
     rows: list[tuple[str, Text | str]] = []
     answered = 0
     with _joined(run_dir) as bus:
-        for process in channels.PROCESSES:
+        for process in cast.names(run_dir.config()):
             try:
                 reply = _ask(bus, process, "status")
             except NoAnswerError:
@@ -100,19 +101,28 @@ def schedule(argv: Sequence[str]) -> int:
 
 def stop(argv: Sequence[str]) -> int:
     """`tenuto stop`."""
-    description = "End the environment server in order; `tenuto run` then ends all the others."
+    description = (
+        "End the environment server, of a fleet all, in order; `tenuto run` then ends all the others."
+    )
     return _order(_run_dir(argv, "stop", description), "stop", channels.ENV_SERVER)
 
 
-def _order(run_dir: RunDir, verb: Verb, process: str, wanted: ScheduleConfig | None = None) -> int:
+def _order(run_dir: RunDir, verb: Verb, role: str, wanted: ScheduleConfig | None = None) -> int:
+    """Give an order to all processes of a role. One that does not answer keeps no other from its own."""
+    failures: list[CommandError] = []
     with _joined(run_dir) as bus:
-        try:
-            reply = _ask(bus, process, verb, wanted)
-        except NoAnswerError as error:
-            raise _silence(run_dir, process) from error
-    if not reply.ok:
-        raise CommandError(f"{process}: {reply.text}")
-    Console().print(f"{process}: {reply.text}", highlight=False, soft_wrap=True)
+        for process in cast.of_role(run_dir.config(), role):
+            try:
+                reply = _ask(bus, process, verb, wanted)
+            except NoAnswerError:
+                failures.append(_silence(run_dir, process))
+                continue
+            if reply.ok:
+                Console().print(f"{process}: {reply.text}", highlight=False, soft_wrap=True)
+            else:
+                failures.append(CommandError(f"{process}: {reply.text}"))
+    if failures:
+        raise CommandError("; ".join(map(str, failures)))
     return DONE
 
 
@@ -132,14 +142,16 @@ def _found(path: Path | None) -> RunDir:
 
 @contextmanager
 def _joined(run_dir: RunDir) -> Iterator[Bus]:
-    link = run_dir.config().link
+    config = run_dir.config()
+    link = config.link
     try:
         with open_bus(
             "client",
             run_dir.run_name,
             run_dir.socket_dir(),
             clock=MonotonicClock(),
-            connect=link.connect,
+            peers=cast.names(config),
+            endpoints=Endpoints(connect=link.connect),
             secure=link.secure,
         ) as bus:
             yield bus

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from rich.console import Console
 from tyro.conf import Positional
@@ -14,13 +13,15 @@ from launcher.chaos.faults import Lives
 from launcher.cli import DONE, CommandError
 from launcher.parsing import parse
 from launcher.vitals import START_NS
-from rtcore import channels
+from rtcore import cast, channels
 from rtcore.bus import Bus, BusError
+from rtcore.cast import role_of
 from rtcore.clock import Clock
 from rtcore.config import ConfigError
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir
 from rtcore.zenoh_bus import open_bus
+from rtcore.zenoh_config import Endpoints
 
 WAIT_S = 0.25
 
@@ -29,8 +30,8 @@ WAIT_S = 0.25
 class HealthOptions:
     """Which process of which run."""
 
-    process: Positional[Literal["env_server", "agent_service", "learner", "recorder"]]
-    """The process."""
+    process: Positional[str]
+    """The process: env_server, agent_service, learner, recorder; of a fleet also like env_server.2."""
     run_dir: Path | None = None
     """The run directory."""
     kill_stuck: bool = False
@@ -41,16 +42,25 @@ def health(argv: Sequence[str]) -> int:
     """`tenuto health PROCESS`."""
     description = "Exit with 0 if a process's own loop turns, with 1 if it does not; on its own machine."
     chosen = parse(HealthOptions, argv, prog="tenuto health", description=description)
+    if role_of(chosen.process) not in channels.PROCESSES:
+        raise _nobody(chosen.process, channels.PROCESSES)
     if chosen.run_dir is None:
         raise ConfigError("run_dir", None, "must be given")
     run_dir = RunDir.open(chosen.run_dir)
     config, clock = run_dir.config(), MonotonicClock()
+    if chosen.process not in cast.names(config):
+        raise _nobody(chosen.process, cast.names(config))
     stuck_s = config.supervise.stuck_s
     try:
         with open_bus(
-            "client", run_dir.run_name, run_dir.socket_dir(), clock=clock, connect=config.link.connect,
+            "client",
+            run_dir.run_name,
+            run_dir.socket_dir(),
+            clock=clock,
+            peers=cast.names(config),
+            endpoints=Endpoints(connect=config.link.connect),
             secure=config.link.secure,
-        ) as bus:  # fmt: skip
+        ) as bus:
             age_s = turned(bus, chosen.process, clock, stuck_s)
     except BusError as error:
         raise CommandError(str(error)) from error
@@ -61,6 +71,10 @@ def health(argv: Sequence[str]) -> int:
         )
     Console().print(f"{chosen.process} turned {age_s:.2f} s ago", highlight=False)
     return DONE
+
+
+def _nobody(process: str, known: Sequence[str]) -> ConfigError:
+    return ConfigError("process", process, "one of " + ", ".join(known))
 
 
 def turned(bus: Bus, process: str, clock: Clock, stuck_s: float) -> float | None:

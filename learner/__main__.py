@@ -21,7 +21,7 @@ def serve(process: Process) -> None:
         process.clock,
         process.ledger,
         levers=Levers(realtime.allowed_cores(), set_threads, realtime.pin),
-        signer=process.signer,
+        signer=process.keys.signer,
     )
     process.bus.serve(channels.LEARNER, service.command)
     process.bus.declare_alive(channels.LEARNER)

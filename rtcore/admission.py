@@ -11,6 +11,7 @@ steps, the agent for observations and policies, the env server for actions.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Sequence
 
 from rtcore.histogram import Histogram
@@ -25,6 +26,11 @@ MAX_EVENT_TEXT = 1_000  # characters; a ledger cuts at 500
 MAX_TICK = 1 << 40  # 35 years at 1 kHz
 MAX_BOUND = 1e30  # of an action: its square is not far from what float32 can hold
 MAX_BATCH_STEPS = 10_000
+# What makes the environments of a fleet the same task: what was learned in one holds in the others.
+_TASK = (
+    "tick_ns", "unit_ns", "observation_dim", "action_dim", "states", "actions", "action_low", "action_high",
+    "action_delay_ticks",
+)  # fmt: skip
 
 
 def check_spec(spec: Spec) -> None:
@@ -47,14 +53,12 @@ def check_spec(spec: Spec) -> None:
 
 def check_same_world(spec: Spec, first: Spec) -> None:
     """A later incarnation of the world that declared itself as `first`."""
-    for name in (
-        "env", "tick_ns", "unit_ns", "observation_dim", "action_dim", "states", "actions", "action_low",
-        "action_high", "action_delay_ticks",
-    ):  # fmt: skip
-        if getattr(spec, name) != getattr(first, name):
-            raise ValueError(
-                f"{name} = {_short(getattr(spec, name))}: the world has {_short(getattr(first, name))}"
-            )
+    _compare(spec, first, ("env", *_TASK))
+
+
+def check_same_task(spec: Spec, first: Spec) -> None:
+    """The world that declared itself as `first`, or another of its fleet."""
+    _compare(spec, first, _TASK)
 
 
 def is_same_world(spec: Spec, first: Spec) -> bool:
@@ -105,7 +109,8 @@ def check_notice(notice: WindowNotice) -> None:
 
 def check_stats(stats: Stats, speakers: Collection[str]) -> None:
     """A ledger of one of the `speakers`, of a size that a reader can keep, whose histograms decode."""
-    if stats.process not in speakers:
+    role, dot, index = stats.process.partition(".")  # of a fleet's process; see `rtcore.cast`
+    if role not in speakers or (dot and not re.fullmatch(r"\d{1,3}", index)):
         raise ValueError(f"process = {_short(stats.process)}: is none of ours")
     for table in (stats.counters, stats.gauges, stats.histograms):
         if len(table) > MAX_NAMES:
@@ -128,6 +133,14 @@ def check_command(command: Command) -> None:
     _names((command.id,))
     if command.schedule is not None and command.verb != "schedule":
         raise ValueError(f"verb = {command.verb}: it takes no schedule")
+
+
+def _compare(spec: Spec, first: Spec, names: Sequence[str]) -> None:
+    for name in names:
+        if getattr(spec, name) != getattr(first, name):
+            raise ValueError(
+                f"{name} = {_short(getattr(spec, name))}: the world has {_short(getattr(first, name))}"
+            )
 
 
 def _finite(steps: Sequence[Step]) -> None:

@@ -113,7 +113,7 @@ RULES: dict[str, Rule] = {
     "env.action_delay_ticks": _whole(0),
     "env.observe_actions": _whole(0),
     "env.hold_ticks": _whole(0),
-    "env.count": _whole(1, 1),
+    "env.count": _whole(1, 16),  # each process has a link to every other one
     "env.start_wait_s": _number("[0, 1e9]"),
     **_drift("env.drift"),
     **_drift("env.physics.mass"),

@@ -65,11 +65,11 @@ def read(path: Path) -> Epoch | None:
         raise ConfigError("epoch", str(path), f"must be a run's beginning ({error})") from error
 
 
-def settle(path: Path, proposed: Epoch, *, now_ns: int, wall_ns: int) -> tuple[Epoch, OSError | None]:
-    """What a life of the env server goes by: `proposed` if it is the first, else what the first one wrote.
+def agree(path: Path, proposed: Epoch, *, now_ns: int, wall_ns: int) -> tuple[Epoch, OSError | None]:
+    """What the run goes by: `proposed`, that very object, if nobody was faster; else what is written there.
 
     Returns:
-        The beginning on this boot's clock, with this life in `lives`; and why it is not on the disk, if so.
+        The beginning on this boot's clock; and why it is not on the disk, if so.
 
     Raises:
         ConfigError: see `read`.
@@ -79,11 +79,24 @@ def settle(path: Path, proposed: Epoch, *, now_ns: int, wall_ns: int) -> tuple[E
     except FileExistsError:
         known = read(path)
         assert known is not None
+        return known.at(now_ns=now_ns, wall_ns=wall_ns, boot_id=proposed.boot_id), None
     except OSError as error:
         return proposed, error
-    else:
-        return proposed, None
-    known = known.at(now_ns=now_ns, wall_ns=wall_ns, boot_id=proposed.boot_id)
+    return proposed, None
+
+
+def settle(path: Path, proposed: Epoch, *, now_ns: int, wall_ns: int) -> tuple[Epoch, OSError | None]:
+    """What a life of the env server goes by: `proposed` if it is the first, else what the first one wrote.
+
+    Returns:
+        The beginning on this boot's clock, with this life in `lives`; and why it is not on the disk, if so.
+
+    Raises:
+        ConfigError: see `read`.
+    """
+    known, problem = agree(path, proposed, now_ns=now_ns, wall_ns=wall_ns)
+    if known is proposed:
+        return proposed, problem
     epoch = replace(known, lives=known.lives + 1)
     try:
         write_atomic(path, _encode(epoch))

@@ -16,11 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from rtcore import channels, realtime, signing
+from rtcore import cast, channels, realtime, signing
 from rtcore.bus import Bus, BusError
+from rtcore.cast import Part
 from rtcore.clock import Clock
 from rtcore.config import ConfigError, RunConfig
+from rtcore.crew import Crew
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Continuations, Stop, die_with_parent, stop_on_signals
 from rtcore.log_files import log_to_file
@@ -29,6 +32,7 @@ from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir
 from rtcore.tally import Tally
 from rtcore.zenoh_bus import ZenohBus, open_bus, open_bus_by_router
+from rtcore.zenoh_config import Endpoints
 from rtcore.zenoh_refusals import LOG_FILTER
 from rtcore.zenoh_session import leave
 from rtcore.zenoh_watch import watched
@@ -38,20 +42,38 @@ JOIN_LIMIT_S = 2.0  # a thread blocked in a put is left behind, so that a proces
 DONE, FAILED, WRONG_INPUT = 0, 1, 2  # exit codes
 
 
+class Keys(NamedTuple):
+    """What policies are signed and checked with: the learner's and the agent's, of any other nothing."""
+
+    signer: signing.Signer
+    verifier: signing.Verifier
+
+
 @dataclass(frozen=True)
 class Process:
-    """One process's resources, open for as long as the `with` block runs."""
+    """One process's resources, open for as long as the `with` block runs.
 
+    Attributes:
+        part: which process of the run it is.
+        config: of the run; of a fleet's env server or agent with the name of its own environment.
+        incarnation: greater than those of its earlier lives.
+    """
+
+    part: Part
     config: RunConfig
     run_dir: RunDir
     clock: Clock
     bus: Bus
     ledger: Ledger
     stop: Stop
-    incarnation: int  # greater than those of its earlier lives
+    incarnation: int
     continuations: Continuations
-    signer: signing.Signer  # the learner's, of policies
-    verifier: signing.Verifier  # the agent's
+    keys: Keys
+
+    @property
+    def name(self) -> str:
+        """The process's name on the bus and in the run's files."""
+        return self.part.name
 
 
 class Reporter:
@@ -114,6 +136,9 @@ def parse(role: str, argv: Sequence[str] | None = None) -> argparse.Namespace:
         metavar="EP",
         help="Zenoh router to reach the others through, and nothing else",
     )
+    parser.add_argument(
+        "--index", type=int, metavar="I", help="env server, agent: which of env.count environments, from 0"
+    )
     parser.add_argument("--supervised", type=int, metavar="PID", help="end when this parent process ends")
     return parser.parse_args(argv)
 
@@ -149,35 +174,34 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
     if arguments.supervised is not None:
         die_with_parent(arguments.supervised)
     run_dir = RunDir.open(arguments.run)
-    config = run_dir.config()
-    log_to_file(run_dir.log_path(role), role)
-    placement = realtime.enter(role, config.agent.rt)  # before the bus: its threads inherit it
+    whole = run_dir.config()
+    part = cast.part_for(whole, role, arguments.index)
+    config, process = cast.as_part(whole, part), part.name
+    log_to_file(run_dir.log_path(process), process)
+    crew = Crew(part.number, config.env.count, config.env.hz or 0.0)
+    placement = realtime.enter(role, config.agent.rt, crew)  # before the bus: its threads inherit it
     clock = MonotonicClock()
-    incarnation = run_dir.next_incarnation(role, time.time_ns())
-    name = run_dir.run_name
-    signer, verifier = (
-        signing.open_signer(config.link, role, name),
-        signing.open_verifier(config.link, role, name),
-    )
+    incarnation = run_dir.next_incarnation(process, time.time_ns())
+    run = run_dir.run_name
+    keys = Keys(signing.open_signer(config.link, role, run), signing.open_verifier(config.link, role, run))
     stop, continuations = Stop(), Continuations(clock.now_ns)
     with (
-        _ledger(run_dir, role, incarnation, clock) as ledger,
+        _ledger(run_dir, process, incarnation, clock) as ledger,
         stop_on_signals(stop),
         continuations.watched(),
         watched(ledger, clock) if config.link.secure else nullcontext(),
-        _open_bus(role, arguments, run_dir, config, clock) as bus,
+        _open_bus(part, arguments, run_dir, whole, clock) as bus,
     ):
-        ledger.event(clock.now_ns(), "INFO", f"{role}: {placement.describe()}")
-        process = Process(
-            config, run_dir, clock, bus, ledger, stop, incarnation, continuations, signer, verifier
-        )
-        reporter = Reporter(ledger, bus, clock, role, continuations)
+        ledger.event(clock.now_ns(), "INFO", f"{process}: {placement.describe()}")
+        reporter = Reporter(ledger, bus, clock, process, continuations)
         try:
             with background(reporter.run, name="reporter", ends=stop):
-                yield process
+                yield Process(
+                    part, config, run_dir, clock, bus, ledger, stop, incarnation, continuations, keys
+                )
         except Exception as error:
-            logging.getLogger(role).exception("%s failed", role)
-            ledger.event(clock.now_ns(), "ERROR", f"{role} failed: {error}")
+            logging.getLogger(process).exception("%s failed", process)
+            ledger.event(clock.now_ns(), "ERROR", f"{process} failed: {error}")
             raise
         finally:
             last = reporter.snapshot(final=True)
@@ -194,40 +218,44 @@ def _keep(run_dir: RunDir, last: Stats) -> None:
 
 
 def _open_bus(
-    role: str, arguments: argparse.Namespace, run_dir: RunDir, config: RunConfig, clock: Clock
+    part: Part, arguments: argparse.Namespace, run_dir: RunDir, config: RunConfig, clock: Clock
 ) -> ZenohBus:
     """The process's connection to the run."""
-    link = config.link
+    link, peers = config.link, cast.names(config)
     if arguments.router:
         if link.secure:
             raise ConfigError(
                 "router", arguments.router, "not with link.secure: it would speak for everybody"
             )
-        return open_bus_by_router(role, run_dir.run_name, arguments.router, clock=clock)
+        return open_bus_by_router(part.name, run_dir.run_name, arguments.router, clock=clock, peers=peers)
     return open_bus(
-        role,
+        part.name,
         run_dir.run_name,
         run_dir.socket_dir(),
         clock=clock,
-        connect=(*link.connect, *arguments.connect),
-        listen=(*link.listen, *arguments.listen),
+        peers=peers,
+        endpoints=Endpoints(
+            connect=(*link.connect, *arguments.connect), listen=(*link.listen, *arguments.listen)
+        ),
         secure=link.secure,
         log_filter=LOG_FILTER if link.secure else "",
     )
 
 
 @contextmanager
-def _ledger(run_dir: RunDir, role: str, incarnation: int, clock: Clock) -> Iterator[Ledger]:
+def _ledger(run_dir: RunDir, process: str, incarnation: int, clock: Clock) -> Iterator[Ledger]:
     """The process's ledger with its tally; without one where the disk has no place for it."""
     with ExitStack() as stack:
         try:
-            tally = stack.enter_context(Tally.create(run_dir.tally_path(role, incarnation)))
+            tally = stack.enter_context(Tally.create(run_dir.tally_path(process, incarnation)))
         except OSError as error:
-            ledger = Ledger(role, incarnation)
+            ledger = Ledger(process, incarnation)
             ledger.count("tally.unbacked")
-            ledger.event(clock.now_ns(), "WARN", f"{role}: counters die with the process: no tally ({error})")
+            ledger.event(
+                clock.now_ns(), "WARN", f"{process}: counters die with the process: no tally ({error})"
+            )
         else:
-            ledger = Ledger(role, incarnation, tally)
+            ledger = Ledger(process, incarnation, tally)
         yield ledger
 
 

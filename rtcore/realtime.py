@@ -21,6 +21,7 @@ from typing import Literal
 from rtcore import libc
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.config import ConfigError
+from rtcore.crew import ALONE, Crew
 
 Rt = Literal["auto", "off", "require"]
 Collector = Literal["frozen", "on"]
@@ -107,19 +108,20 @@ class Placement:
         return f"{line}; refused: {', '.join(self.missing)}" if self.missing else line
 
 
-def enter(role: str, rt: Rt) -> Placement:
+def enter(role: str, rt: Rt, crew: Crew = ALONE) -> Placement:
     """Give this process its place. Call it before threads start and the bus opens: they inherit it.
 
     Args:
         role: one of `channels.PROCESSES`.
         rt: "auto": as much as the system grants; "require": all of it; "off": only what costs the rest
             of the machine nothing, the timer slack and the collector.
+        crew: the pairs of env server and agent that there are.
 
     Raises:
         RealtimeError: "require", and the system refuses something.
         ConfigError: no such role.
     """
-    placement = apply(plan(role, rt, allowed_cores(), privileges()))
+    placement = apply(plan(role, rt, allowed_cores(), privileges(), crew))
     if rt == "require" and placement.missing:
         raise RealtimeError(role, placement.missing)
     return placement
@@ -157,7 +159,7 @@ def out_of_the_way(rt: Rt) -> Iterator[None]:
             pin(allowed)
 
 
-def plan(role: str, rt: Rt, allowed: Sequence[int], granted: Privileges) -> Plan:
+def plan(role: str, rt: Rt, allowed: Sequence[int], granted: Privileges, crew: Crew = ALONE) -> Plan:
     """Decide, without touching anything.
 
     Args:
@@ -165,23 +167,25 @@ def plan(role: str, rt: Rt, allowed: Sequence[int], granted: Privileges) -> Plan
         rt: see `enter`.
         allowed: the cores that this process may use, at least one.
         granted: see `privileges`.
+        crew: the pairs of env server and agent that there are.
     """
     if role not in PROCESSES:
         raise ConfigError("role", role, f"must be one of {', '.join(PROCESSES)}")
     acting = role in (ENV_SERVER, AGENT)
     if rt == "off":
         return Plan(role, None, (), None, lock_memory=False, freeze_collector=acting, missing=())
-    first, *others = sorted(allowed)
+    cores = sorted(allowed)
+    pairs = cores[: crew.cores(len(cores))]
     if not acting:
-        cores = tuple(others) or (first,)
-        return Plan(role, None, cores, NICE[role], lock_memory=False, freeze_collector=False, missing=())
+        others = tuple(cores[len(pairs) :] or cores)
+        return Plan(role, None, others, NICE[role], lock_memory=False, freeze_collector=False, missing=())
     missing = {FIFO: granted.max_priority <= BACKGROUND_PRIORITY, MEMORY: not granted.lock_memory}
     return Plan(
         role,
         fifo_priority=None if missing[FIFO] else min(FIFO_PRIORITY, granted.max_priority),
         # Together on one core even without FIFO: loop p50/p99 at 500 Hz beside a learner 242/593 us,
         # misses 0.04 %, against 298/1364 us and 1.2 % with everything free to move.
-        cores=(first,),
+        cores=(pairs[crew.number % len(pairs)],),
         nice=None,
         lock_memory=granted.lock_memory,
         freeze_collector=True,

@@ -99,14 +99,14 @@ class RunDir:
         """The newest published policy; None if none was, or if the file is damaged, which is logged."""
         return _read_policy(self.policy_path)
 
-    @property
-    def adopted_path(self) -> Path:
-        """`agent/policy.msgpack`: the newest policy that the agent took, where no learner keeps one."""
-        return self.path / "agent" / "policy.msgpack"
+    def adopted_path(self, agent: str) -> Path:
+        """`agent/policy.msgpack`, or of a fleet's agent `agent/policy.2.msgpack`: the newest policy that it
+        took, where no learner keeps one."""
+        return self.path / "agent" / f"policy{_number(agent)}.msgpack"
 
-    def read_adopted(self) -> Policy | None:
+    def read_adopted(self, agent: str) -> Policy | None:
         """What is in `adopted_path`; None as in `read_policy`."""
-        return _read_policy(self.adopted_path)
+        return _read_policy(self.adopted_path(agent))
 
     @property
     def logs_dir(self) -> Path:
@@ -134,6 +134,10 @@ class RunDir:
     def epoch_path(self) -> Path:
         """`epoch.json`: when the run began (`rtcore.epoch`)."""
         return self.path / "epoch.json"
+
+    def lives_path(self, env_server: str) -> Path:
+        """`epoch.json`, or of a fleet's env server `epoch.2.json`: the same with its own lives."""
+        return self.path / f"epoch{_number(env_server)}.json"
 
     def config(self) -> RunConfig:
         """The run's configuration, checked: people edit `run.toml`.
@@ -180,13 +184,13 @@ class RunDir:
         earlier = [
             int(found[1])
             for path in self.logs_dir.glob(f"{_plain(process)}-*")
-            if (found := re.fullmatch(rf"{process}-(\d{{1,19}})\.(stats|tally)", path.name))
+            if (found := re.fullmatch(rf"{re.escape(process)}-(\d{{1,19}})\.(stats|tally)", path.name))
         ]
         return max([wall_ns, *(life + 1 for life in earlier)])
 
     def _tallies(self) -> Iterator[tuple[tuple[str, int], dict[str, int]]]:
         for path in self.logs_dir.glob("*.tally"):
-            life = re.fullmatch(r"([A-Za-z0-9_-]+)-(\d{1,19})\.tally", path.name)
+            life = re.fullmatch(r"([A-Za-z0-9_.-]+)-(\d{1,19})\.tally", path.name)
             if life is None:
                 continue
             try:
@@ -274,9 +278,15 @@ def _read_policy(path: Path) -> Policy | None:
 
 
 def _plain(process: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", process):
+    if not re.fullmatch(r"[A-Za-z0-9_-]+(\.\d+)?", process):
         raise ValueError(f"process = {process!r}: must be a plain name")
     return process
+
+
+def _number(process: str) -> str:
+    """What tells a fleet's processes of one role apart, with the dot; empty where there is one."""
+    _, dot, number = process.partition(".")
+    return dot + number
 
 
 def _rmdir(path: Path) -> None:

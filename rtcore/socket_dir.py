@@ -16,6 +16,7 @@ from rtcore.config import ConfigError
 SOCKET_PATH_BYTES = 100
 # Fixed rather than $TMPDIR: all processes of a run must find the same directory, whoever started them.
 TEMP = Path("/tmp")
+_SOCKET = re.compile(rf"({'|'.join(PROCESSES)})(\.\d+)?\.sock(\.lock)?")  # of a fleet with a number
 PORTS = "ports.json"  # of `rtcore.zenoh_ports`
 
 
@@ -49,9 +50,9 @@ def remove(run: Path) -> None:
     if not directory.is_dir() or directory.is_symlink() or directory.stat().st_uid != os.geteuid():
         return
     (directory / PORTS).unlink(missing_ok=True)
-    for process in PROCESSES:
-        for name in (f"{process}.sock", f"{process}.sock.lock"):
-            (directory / name).unlink(missing_ok=True)
+    for path in directory.iterdir():
+        if _SOCKET.fullmatch(path.name):
+            path.unlink(missing_ok=True)
     with suppress(OSError):
         directory.rmdir()
 
@@ -61,7 +62,9 @@ def path_for(run: Path) -> Path:
     # Resolved: processes that were given the run by different paths must come to the same answer.
     home = run.resolve()
     near = home / "link"
-    longest = max(len(os.fsencode(near / f"{process}.sock")) for process in PROCESSES)
+    longest = max(
+        len(os.fsencode(near / f"{process}.sock")) for process in PROCESSES
+    )  # a fleet's: 2 to 3 more
     if longest <= SOCKET_PATH_BYTES and re.fullmatch(r"[A-Za-z0-9_./+-]+", str(near)):
         return near
     digest = hashlib.sha256(os.fsencode(home)).hexdigest()[:16]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from rtcore.cast import PER_ENV
 from rtcore.channels import ALIVE_KEY, CONTROL_KEY, LAUNCHER, TABLE
 from rtcore.signing import OPERATOR, ROLES
 
@@ -73,9 +74,14 @@ def _own(role: str) -> dict[str, tuple[tuple[str, ...], list[str]]]:
         }
     return {
         "write": (WRITING, list(_written(role))),
-        "live": (("liveliness_token",), [ALIVE_KEY.format(name=role)]),
-        "obey": (ANSWERING, [CONTROL_KEY.format(name=role)]),
+        "live": (("liveliness_token",), [ALIVE_KEY.format(name=name) for name in _names(role)]),
+        "obey": (ANSWERING, [CONTROL_KEY.format(name=name) for name in _names(role)]),
     }
+
+
+def _names(role: str) -> tuple[str, ...]:
+    """Of the processes with the certificate of `role`: in a fleet they are numbered."""
+    return (role, f"{role}.$*") if role in PER_ENV else (role,)
 
 
 def _written(writer: str) -> Iterator[str]:
@@ -83,5 +89,6 @@ def _written(writer: str) -> Iterator[str]:
     for channel in TABLE:
         if writer in channel.writers:
             # Several writers on a channel have a name each; a single one writes for all environments.
-            key = channel.key_for(writer if len(channel.writers) > 1 else "*")
-            yield from (key, f"{key}/@adv/**")
+            for name in _names(writer) if len(channel.writers) > 1 else ("*",):
+                key = channel.key_for(name)
+                yield from (key, f"{key}/@adv/**")

@@ -18,7 +18,8 @@ from zenoh import ext, handlers
 
 from rtcore.base_bus import BaseBus
 from rtcore.bus import BusError, Publisher
-from rtcore.channels import ALIVE_KEY, CONTROL_KEY, Channel, Delivery, MessageT
+from rtcore.cast import role_of
+from rtcore.channels import ALIVE_KEY, CONTROL_KEY, PROCESSES, Channel, Delivery, MessageT
 from rtcore.clock import Clock
 from rtcore.codec import Codec, check_name, key_for, name_in
 from rtcore.commands import CommandClient, CommandServer
@@ -27,7 +28,7 @@ from rtcore.lossless import Fetch, LosslessFeed
 from rtcore.messages import Command, CommandReply
 from rtcore.signing import OPERATOR, identity
 from rtcore.zenoh_access import FLUSH_KEY
-from rtcore.zenoh_config import CLIENT, Security, session_config
+from rtcore.zenoh_config import CLIENT, NO_MORE, Endpoints, Security, session_config
 from rtcore.zenoh_ports import local_ports
 from rtcore.zenoh_router import through_router
 from rtcore.zenoh_senders import LOSSLESS_CACHE, ZenohPublisher, declare_sender
@@ -40,13 +41,13 @@ RETRY_S = 0.1  # before an unanswered command's second try; the queue of replies
 
 
 def open_bus(
-    role: str,
+    process: str,
     run_name: str,
     socket_dir: Path,
     *,
     clock: Clock,
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
+    peers: Sequence[str] = PROCESSES,
+    endpoints: Endpoints = NO_MORE,
     secure: str = "",
     log_filter: str = "",
 ) -> ZenohBus:
@@ -55,38 +56,44 @@ def open_bus(
     Returns within half a second, whoever is there. Zenoh's threads inherit the caller's scheduling.
 
     Args:
-        role: one of `channels.PROCESSES`, or "client".
+        process: one of `peers`, or "client".
         run_name: the run.
-        socket_dir: a directory of mode 0700; every role's socket is in it.
+        socket_dir: a directory of mode 0700; every process's socket is in it.
         clock: gives the stamps of received messages.
-        connect: further endpoints to connect to.
-        listen: further endpoints to listen on.
-        secure: the directory with the keys of this role; empty: unix sockets, and endpoints as they are.
+        peers: the names of all processes of the run, in connect order (`rtcore.cast.names`).
+        endpoints: further ones.
+        secure: the directory with the keys of each role; empty: unix sockets, and endpoints as they are.
         log_filter: what Zenoh writes to standard output; see `zenoh_watch`.
 
     Raises:
         ValueError: an argument that no session can be made of.
         ConfigError: a certificate or an endpoint does not do for secured links.
-        BusError: Zenoh refuses, as when a process of this role runs already.
+        BusError: Zenoh refuses, as when a process of this name runs already.
     """
-    found = identity(secure, OPERATOR if role == CLIENT else role)
-    security = None if found is None else Security(found, local_ports(socket_dir))
-    settings = session_config(role, run_name, socket_dir, connect=connect, listen=listen, security=security)
-    return _join(settings, role, f"the run in {socket_dir}", clock, log_filter)
+    found = identity(secure, OPERATOR if process == CLIENT else role_of(process))
+    security = None if found is None else Security(found, local_ports(socket_dir, peers))
+    settings = session_config(
+        process, run_name, socket_dir, peers=peers, endpoints=endpoints, security=security
+    )
+    return _join(settings, process, f"the run in {socket_dir}", clock, log_filter)
 
 
-def open_bus_by_router(role: str, run_name: str, router: str, *, clock: Clock) -> ZenohBus:
+def open_bus_by_router(
+    process: str, run_name: str, router: str, *, clock: Clock, peers: Sequence[str] = PROCESSES
+) -> ZenohBus:
     """Join a run by the Zenoh router at the endpoint `router` alone; otherwise see `open_bus`."""
-    settings = through_router(session_config(role, run_name, Path()), router)
-    return _join(settings, role, f"a run by {router}", clock)
+    settings = through_router(session_config(process, run_name, Path(), peers=peers), router)
+    return _join(settings, process, f"a run by {router}", clock)
 
 
-def _join(settings: dict[str, object], role: str, where: str, clock: Clock, log_filter: str = "") -> ZenohBus:
+def _join(
+    settings: dict[str, object], process: str, where: str, clock: Clock, log_filter: str = ""
+) -> ZenohBus:
     try:
         session = open_session(settings, log_filter)
     except zenoh.ZError as error:
-        raise BusError(f"{role} cannot join {where} (does it run already?): {error}") from error
-    bus = ZenohBus(session, role, clock)
+        raise BusError(f"{process} cannot join {where} (does it run already?): {error}") from error
+    bus = ZenohBus(session, process, clock)
     bus.join()
     return bus
 
@@ -104,8 +111,8 @@ def _on_flush(query: zenoh.Query) -> None:
 class ZenohBus(BaseBus):
     """One process's connection to the run; see `rtcore.bus.Bus`. Made by `open_bus`."""
 
-    def __init__(self, session: zenoh.Session, role: str, clock: Clock) -> None:
-        super().__init__(role, clock)
+    def __init__(self, session: zenoh.Session, process: str, clock: Clock) -> None:
+        super().__init__(process, clock)
         self._session = session
         self._held: list[object] = []  # Zenoh drops what nobody refers to
         self._lock = threading.Lock()

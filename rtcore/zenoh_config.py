@@ -1,8 +1,8 @@
 """The settings of a Zenoh session, as data: one run's peers on one machine, and any further endpoints.
 
 Peers without a router. Every process offers a unix socket in the run's directory and connects to the
-processes that come before it in `channels.PROCESSES`, so that each pair has one link whatever the
-order in which they start. Where links are secured, a port on the loopback with mutual TLS takes the
+processes that come before it in connect order (`rtcore.cast`), so that each pair has one link whatever
+the order in which they start. Where links are secured, a port on the loopback with mutual TLS takes the
 socket's place, and nothing else is spoken. Each constant below carries the measurement (Zenoh 1.10.2, two
 cores) that set it.
 """
@@ -47,9 +47,20 @@ OPEN_DELAY_MS = 300  # `open` waits so long at most for processes that are not t
 MAX_MESSAGE_BYTES = 64 << 20
 
 
-def socket_path(socket_dir: Path, role: str) -> Path:
-    """Where `role` listens."""
-    return socket_dir / f"{role}.sock"
+def socket_path(socket_dir: Path, process: str) -> Path:
+    """Where the process of that name listens."""
+    return socket_dir / f"{process}.sock"
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Where a session goes beyond its run's own sockets; each like `tcp/host:7447`."""
+
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+
+
+NO_MORE = Endpoints()
 
 
 @dataclass(frozen=True)
@@ -61,39 +72,40 @@ class Security:
 
 
 def session_config(
-    role: str,
+    process: str,
     run_name: str,
     socket_dir: Path,
     *,
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
+    peers: Sequence[str] = channels.PROCESSES,
+    endpoints: Endpoints = NO_MORE,
     security: Security | None = None,
 ) -> dict[str, object]:
     """The configuration of one process's session, as Zenoh reads it.
 
     Args:
-        role: one of `channels.PROCESSES`, or `CLIENT`.
+        process: one of `peers`, or `CLIENT`.
         run_name: separates the keys of runs that meet on a network.
         socket_dir: the run's directory for sockets.
-        connect: further endpoints to connect to, such as `tcp/host:7447`.
-        listen: further endpoints to listen on.
+        peers: the names of all processes of the run, in connect order (`rtcore.cast.names`).
+        endpoints: further ones.
         security: for secured links; None: unix sockets, and endpoints as they are.
 
     Raises:
         ValueError: an argument that no session can be made of.
     """
-    if role not in (*channels.PROCESSES, CLIENT):
-        raise ValueError(f"role = {role!r}: must be one of {', '.join((*channels.PROCESSES, CLIENT))}")
+    if process not in (*peers, CLIENT):
+        raise ValueError(f"process = {process!r}: must be one of {', '.join((*peers, CLIENT))}")
     if not run_name:
         raise ValueError("run_name is empty")
-    own, earlier = _own_and_earlier(role)
+    own, earlier = _own_and_earlier(process, tuple(peers))
     namespace = f"tenuto/{quote(run_name, safe='')}"
+    connect, listen = endpoints.connect, endpoints.listen
     protocols = _protocols((*connect, *listen), security)
     secured = {} if security is None else {"access_control": access_control(namespace)}
     return {
         "mode": "peer",
         "namespace": namespace,
-        "metadata": {"name": role},
+        "metadata": {"name": process},
         "listen": {
             "endpoints": [*(_endpoint(socket_dir, name, security) for name in own), *listen],
             "timeout_ms": 0,
@@ -169,16 +181,16 @@ def _tls(identity: Identity) -> dict[str, object]:
     }
 
 
-def _own_and_earlier(role: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    if role == CLIENT:
-        return (), channels.PROCESSES
-    return (role,), channels.PROCESSES[: channels.PROCESSES.index(role)]
+def _own_and_earlier(process: str, peers: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    if process == CLIENT:
+        return (), peers
+    return (process,), peers[: peers.index(process)]
 
 
-def _endpoint(socket_dir: Path, role: str, security: Security | None) -> str:
+def _endpoint(socket_dir: Path, process: str, security: Security | None) -> str:
     if security is not None:
-        return f"tls/{HOST}:{security.ports[role]}"
-    path = socket_path(socket_dir, role)
+        return f"tls/{HOST}:{security.ports[process]}"
+    path = socket_path(socket_dir, process)
     _check_socket_path(path)
     return f"unixsock-stream/{path}"
 

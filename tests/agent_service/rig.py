@@ -46,13 +46,13 @@ def policy(version: int, *, mean_bias: float = 0.0, architecture: Architecture =
 class Rig:
     """An agent, and the two ends that it talks to."""
 
-    def __init__(self, hub: MemoryHub, seed: int = 3, past: Past | None = None) -> None:
+    def __init__(self, hub: MemoryHub, seed: int = 3, past: Past | None = None, number: int = 0) -> None:
         self.clock = VirtualClock(1_000)
         self.env: Bus = hub.bus(channels.ENV_SERVER, self.clock)
         self.learner: Bus = hub.bus(channels.LEARNER, self.clock)
         self.ledger = Ledger(channels.AGENT, 1)
         bus = hub.bus(channels.AGENT, self.clock)
-        self.agent = AgentService(RunConfig(seed=seed), bus, self.clock, self.ledger, past)
+        self.agent = AgentService(RunConfig(seed=seed), bus, self.clock, self.ledger, past, number=number)
         self.actions = self.env.queue(channels.ACTION, "env0")
         self.specs = self.env.publisher(channels.SPEC, "env0")
         self.steps = self.env.publisher(channels.STEP, "env0")

@@ -78,7 +78,7 @@ def test_the_floor_is_what_the_last_life_with_a_policy_had(run: RunDir) -> None:
 
 
 def test_the_newer_of_two_files_is_the_newest(run: RunDir) -> None:
-    for path, version in ((run.policy_path, 3), (run.adopted_path, 5)):
+    for path, version in ((run.policy_path, 3), (run.adopted_path(AGENT), 5)):
         path.parent.mkdir(exist_ok=True)
         write_atomic(path, msgspec.msgpack.encode(policy(version)))
     newest = past(run).newest
@@ -103,7 +103,7 @@ def test_the_agent_keeps_what_the_learner_has_not_written(
         write_atomic(run.policy_path, msgspec.msgpack.encode(policy(learners)))
     ledger = Ledger(AGENT, 1)
     Kept(run, ledger, VirtualClock(), OnlyTo8()).keep(policy(7))
-    found = run.read_adopted()
+    found = run.read_adopted(AGENT)
     assert (None if found is None else found.version) == kept
     assert ledger.counter("policies.foreign") == 0  # nobody wanted to act on it
 

@@ -34,6 +34,15 @@ def test_pi_0_answers_within_the_bounds_and_repeats_with_its_seed(rig: Rig) -> N
     np.testing.assert_array_equal(drawn, [values(other.answer(step(tick))) for tick in range(50)])
 
 
+def test_agents_of_a_fleet_explore_apart() -> None:
+    drawn = []
+    for number in (0, 1, 1, 2):
+        one = Rig(MemoryHub(), number=number)
+        one.specs.put(SPEC)
+        drawn.append(tuple(values(one.answer(step(0)))))
+    assert drawn[1] == drawn[2] and len(set(drawn)) == 3
+
+
 def test_what_waited_behind_a_stall_for_more_than_two_ticks_is_not_answered(rig: Rig) -> None:
     rig.specs.put(SPEC)
     rig.answer(step(0))

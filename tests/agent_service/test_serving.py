@@ -9,12 +9,13 @@ import pytest
 from agent_service import serving
 from agent_service.service import AgentService
 from rtcore import channels
+from rtcore.cast import Part
 from rtcore.clock import VirtualClock
 from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
 from rtcore.lifecycle import Continuations, Stop
 from rtcore.memory_bus import MemoryHub
-from rtcore.process import Process
+from rtcore.process import Keys, Process
 from rtcore.run_dir import RunDir
 from rtcore.signing import NoSigner, NoVerifier
 from tests.agent_service.rig import SPEC, policy
@@ -27,7 +28,16 @@ def test_a_policy_that_is_ready_when_acting_fails_has_its_fate(
     run = RunDir.create(tmp_path / "run", RunConfig())
     bus = hub.bus(channels.AGENT, clock)
     process = Process(
-        RunConfig(), run, clock, bus, ledger, Stop(), 1, Continuations(clock.now_ns), NoSigner(), NoVerifier()
+        Part(channels.AGENT),
+        RunConfig(),
+        run,
+        clock,
+        bus,
+        ledger,
+        Stop(),
+        1,
+        Continuations(clock.now_ns),
+        Keys(NoSigner(), NoVerifier()),
     )
     specs = hub.bus(channels.ENV_SERVER, clock).publisher(channels.SPEC, "env0")
     policies = hub.bus(channels.LEARNER, clock).publisher(channels.POLICY)

@@ -10,7 +10,8 @@ import pytest
 from env_server.announcing import LEAD_NS, RETURN_WAIT_S, Beginning, Past, begin, go_on, wait_for_peers
 from env_server.service import EnvService
 from env_server.worlds.registry import resolve
-from rtcore import channels
+from rtcore import cast, channels
+from rtcore.cast import Part
 from rtcore.clock import VirtualClock
 from rtcore.config import RunConfig
 from rtcore.epoch import Epoch, read
@@ -128,6 +129,63 @@ def test_lives_share_a_clock_a_drift_and_an_end(tmp_path: Path) -> None:
     assert known is not None and known.lives == 2
 
 
+class Ticking(Stop):
+    """Whose waits take virtual time."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def wait(self, timeout_s: float) -> bool:
+        self._clock.advance_ns(round(timeout_s * 1e9))
+        return False
+
+
+def test_a_fleet_has_one_t0_and_whoever_comes_late_begins_at_the_present_tick(tmp_path: Path) -> None:
+    """T0 is 0.3 s after the first one proposes it. The second is there 0.15 s later: 0.15 s before T0, more
+    than the lead, so it begins at tick 0. The third comes 0.5 s after the first: 0.2 s of run time and a lead
+    of 0.1 s, so tick 30 of 100 Hz. Its second life has lives of its own. The deadlines of all are spread over
+    a period."""
+    clock, config = VirtualClock(START_NS), run_config(count=3)
+    run_dir, ledger = RunDir.create(tmp_path / "run", config), Ledger("env_server.0", 1)
+
+    def beginning(index: int) -> Beginning:
+        past = Past(run_dir, lambda: WALL_NS, Part(channels.ENV_SERVER, index))
+        return begin(config, past, clock, ledger, tick_ns=TICK_NS)
+
+    first = beginning(0)
+    clock.advance_ns(150 * MS)
+    second = beginning(1)
+    clock.advance_ns(350 * MS)
+    third = beginning(2)
+    again = beginning(2)
+    t0_ns = START_NS + 300 * MS
+    assert [one.epoch.t0_ns for one in (first, second, third, again)] == [
+        t0_ns, t0_ns + TICK_NS // 3, t0_ns + 2 * TICK_NS // 3, t0_ns + 2 * TICK_NS // 3,
+    ]  # fmt: skip
+    assert [one.first_index for one in (first, second, third)] == [0, 0, 30]
+    assert [one.down for one in (first, second, third)] == [0, 0, 30]
+    assert [one.epoch.lives for one in (first, second, third, again)] == [1, 1, 1, 2]
+    assert {one.end_index for one in (first, second, third)} == {100}
+
+
+def test_a_fleet_waits_for_everybody_but_itself(tmp_path: Path) -> None:
+    clock, config = VirtualClock(START_NS), run_config(count=2, start_wait_s=15.0)
+    hub, past = MemoryHub(), Past(part=Part(channels.ENV_SERVER, 1))
+    missing, ledger = "agent_service.0", Ledger("env_server.1", 1)
+    bus = hub.bus("env_server.1", clock)
+    for name in cast.names(config):
+        if name not in (missing, past.part.name):
+            hub.bus(name, clock).declare_alive(name)
+    wait_for_peers(config, past, bus, clock, ledger, Ticking(clock))
+    assert clock.now_ns() - START_NS == 15_000 * MS
+    (event,) = ledger.stats(1).events
+    assert event.text == "starting without agent_service.0 after 15 s"
+    hub.bus(missing, clock).declare_alive(missing)
+    wait_for_peers(config, past, bus, clock, ledger, Ticking(clock))
+    assert clock.now_ns() - START_NS == 15_000 * MS
+
+
 def test_a_life_after_the_end_does_not_tick(tmp_path: Path) -> None:
     lives = Lives(tmp_path, run_config())
     lives.live(25, down_s=5.0)
@@ -143,15 +201,10 @@ def test_where_the_run_has_begun_nobody_is_waited_for_long(
     clock = VirtualClock(START_NS)
     ledger = Ledger("env_server", 1)
 
-    class Ticking(Stop):
-        def wait(self, timeout_s: float) -> bool:
-            clock.advance_ns(round(timeout_s * 1e9))
-            return False
-
     config = run_config(start_wait_s=15.0)
     run_dir = RunDir.create(tmp_path / "run", config)
     if begun:
         begin(config, Past(run_dir), clock, ledger, tick_ns=TICK_NS)
-    wait_for_peers(config, Past(run_dir), MemoryHub().bus("env", clock), clock, ledger, Ticking())
+    wait_for_peers(config, Past(run_dir), MemoryHub().bus("env", clock), clock, ledger, Ticking(clock))
     assert clock.now_ns() - START_NS == round(waited_s * 1e9)
     assert ledger.stats(1).beat_ns == clock.now_ns()

@@ -16,6 +16,7 @@ def make(
     *,
     episode_steps: int = 4,
     seed: int = 7,
+    number: int = 0,
     observe: int = 0,
     notify: Notify = "none",
 ) -> Rollout:
@@ -23,7 +24,9 @@ def make(
         on_miss="hold", hold_ticks=1, action_delay_ticks=0, observe_actions=observe, low=world.action_low,
         high=world.action_high, incarnation=1,
     )  # fmt: skip
-    return Rollout(world, Actuation(rules), episode_steps=episode_steps, seed=seed, notify=notify)
+    return Rollout(
+        world, Actuation(rules), episode_steps=episode_steps, seed=seed, number=number, notify=notify
+    )
 
 
 def turns(rollout: Rollout, number: int, t: int = 2) -> list[Turn]:
@@ -70,6 +73,15 @@ def test_resets_are_seeded_by_run_and_episode() -> None:
         seeds.append(world.seeds)
     assert seeds[0] == seeds[1] != seeds[2]
     assert len(set(seeds[0])) == 3 and None not in seeds[0]
+
+
+def test_environments_of_a_fleet_start_apart() -> None:
+    worlds = [ScriptedWorld() for _ in range(3)]
+    for world, number in zip(worlds, (0, 1, 1), strict=True):
+        turns(make(world, episode_steps=1, number=number), 6)
+    assert worlds[1].seeds == worlds[2].seeds
+    assert not set(worlds[0].seeds) & set(worlds[1].seeds)
+    assert worlds[0].seeds[0] == int(np.random.SeedSequence([7, 0, 0]).generate_state(1)[0])
 
 
 def test_decisions_are_appended_to_the_observation() -> None:

@@ -124,6 +124,8 @@ def test_a_phase_that_cannot_be(fields: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
+        ({"process": "learner.x"}, "process = 'learner.x': is none of ours"),
+        ({"process": "env_server."}, r"process = 'env_server\.': is none of ours"),
         ({"process": "nobody"}, "process = 'nobody': is none of ours"),
         ({"process": "x" * 300}, r"process = 'x{79}\.\.\.: is none of ours"),
         ({"counters": {str(number): 1 for number in range(513)}}, "513 names: at most 512"),
@@ -138,6 +140,11 @@ def test_a_phase_that_cannot_be(fields: dict[str, Any]) -> None:
 def test_a_ledger_that_cannot_be(fields: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         channels.STATS.check(replace(stats("learner"), **fields))
+
+
+def test_a_process_of_a_fleet_speaks_under_its_own_name() -> None:
+    for process in ("env_server.0", "agent_service.15", "launcher"):
+        channels.STATS.check(stats(process))
 
 
 def test_a_ledger_may_have_what_a_diverging_learner_has() -> None:

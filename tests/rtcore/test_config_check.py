@@ -87,7 +87,7 @@ def test_no_field_takes_anything() -> None:
         ("env.observe_actions", -1, "must be an integer in 0..1000000000"),
         ("env.on_miss", "panic", "must be one of 'hold', 'neutral', 'hold_then_neutral'"),
         ("env.hold_ticks", -1, "must be an integer in 0..1000000000"),
-        ("env.count", 2, "must be 1"),
+        ("env.count", 17, "must be an integer in 1..16"),
         ("env.start_wait_s", -0.1, "must be in [0, 1e9]"),
         ("env.drift.kind", "steps", None),
         ("env.drift.offset", NAN, "must be in [-1e12, 1e12]"),

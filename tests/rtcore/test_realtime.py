@@ -13,6 +13,7 @@ import pytest
 
 from rtcore import channels, realtime
 from rtcore.config import ConfigError
+from rtcore.crew import Crew
 from rtcore.realtime import FIFO, MEMORY, Placement, Plan, Privileges, RealtimeError, plan
 
 ROOT = Path(__file__).parents[2]
@@ -226,6 +227,31 @@ done.set()
 def test_a_process_that_is_nicer_already_stays_so() -> None:
     (placed,) = in_process('os.nice(19); show(realtime.enter("learner", "auto"))')
     assert placed["nice"] == 19
+
+
+@pytest.mark.parametrize(
+    ("count", "hz", "available", "cores"),
+    [
+        (1, 1000.0, 8, 1),  # a pair has one core
+        (4, 200.0, 8, 1),  # 4 * 200 * 0.4 ms = 0.32 of a core: one promises 0.5
+        (2, 625.0, 8, 1),  # exactly 0.5
+        (4, 500.0, 2, 2),  # 0.8
+        (4, 500.0, 1, 1),
+        (4, 2000.0, 16, 4),  # no more than pairs
+        (16, 200.0, 16, 3),  # 1.28
+    ],
+)
+def test_a_fleet_shares_as_few_cores_as_carry_it(count: int, hz: float, available: int, cores: int) -> None:
+    assert Crew(0, count, hz).cores(available) == cores
+
+
+def test_pairs_of_a_fleet_are_dealt_to_its_cores_and_the_others_keep_off() -> None:
+    crews = [Crew(number, 4, 500.0) for number in range(4)]
+    for role in ("env_server", "agent_service"):
+        dealt = [plan(role, "auto", (3, 5, 7, 9), ALL, crew).cores for crew in crews]
+        assert dealt == [(3,), (5,), (3,), (5,)]
+    assert plan("learner", "auto", (3, 5, 7, 9), ALL, Crew(0, 4, 500.0)).cores == (7, 9)
+    assert plan("recorder", "auto", (0, 1), ALL, Crew(0, 4, 500.0)).cores == (0, 1)
 
 
 def test_off_changes_neither_cores_nor_scheduler() -> None:

@@ -72,8 +72,8 @@ def test_what_exists_is_refused_and_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_wrong_configuration_makes_nothing(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^env\.count = 3: must be 1$"):
-        RunDir.create(tmp_path / "a" / "b", RunConfig(env=EnvConfig(count=3)))
+    with pytest.raises(ConfigError, match=r"^env\.count = 0: must be an integer in 1\.\.16$"):
+        RunDir.create(tmp_path / "a" / "b", RunConfig(env=EnvConfig(count=0)))
     assert below(tmp_path) == set()
 
 
@@ -244,6 +244,25 @@ def test_a_tally_raises_the_last_words_and_stands_for_those_that_were_never_said
     assert killed.counters == {"ticks": 5, "resets": 1}
     run.tally_path("recorder", 1).write_bytes(b"torn")
     assert [one.counters for one in run.read_final_stats()][2:] == [{}]
+
+
+def test_processes_of_a_fleet_have_files_of_their_own(tmp_path: Path) -> None:
+    run = RunDir.create(tmp_path / "one", CONFIG)
+    for process, ticks in (("env_server.0", 3), ("env_server.1", 4), ("env_server", 5)):
+        with Tally.create(run.tally_path(process, 9)) as tally:
+            tally.set_together({"ticks": ticks})
+    found = {one.process: one.counters for one in run.read_final_stats()}
+    assert found == {"env_server.0": {"ticks": 3}, "env_server.1": {"ticks": 4}, "env_server": {"ticks": 5}}
+    assert run.next_incarnation("env_server.1", 5) == 10
+    assert run.next_incarnation("env_server.2", 5) == 5
+    names = [path.name for path in (run.log_path("agent_service.2"), run.lives_path("env_server.2"))]
+    assert names == ["agent_service.2.jsonl", "epoch.2.json"]
+    assert run.lives_path("env_server") == run.epoch_path
+    assert run.adopted_path("agent_service.2").name == "policy.2.msgpack"
+    assert run.adopted_path("agent_service").name == "policy.msgpack"
+    for name in ("env_server.", "env_server.x", "..", "a/b.1"):
+        with pytest.raises(ValueError, match="must be a plain name"):
+            run.log_path(name)
 
 
 def test_an_incarnation_is_greater_than_all_before_it(tmp_path: Path) -> None:

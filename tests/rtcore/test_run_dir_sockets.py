@@ -102,6 +102,8 @@ def test_stale_sockets_go_and_strangers_stay(far: RunDir) -> None:
     directory = far.socket_dir()
     (directory / "learner.sock").touch()
     (directory / "learner.sock.lock").touch()
+    (directory / "agent_service.12.sock").touch()
+    (directory / "agent_service.12.sock.lock").touch()
     (directory / "stranger").touch()
     far.remove_socket_dir()
     assert [path.name for path in directory.iterdir()] == ["stranger"]

@@ -24,10 +24,15 @@ def with_cache(*keys: str) -> set[str]:
     return {*keys, *(f"{key}/@adv/**" for key in keys)}
 
 
+def named(key: str) -> tuple[str, str]:
+    """A key that ends with the name of an env server or an agent, and those of a fleet's."""
+    return key, f"{key}.$*"
+
+
 def test_each_role_writes_its_own_channels() -> None:
     assert {role: allowed(role, "put") for role in ROLES} == {
-        channels.ENV_SERVER: with_cache("env/*/spec", "env/*/step", "env/*/log", "stats/env_server"),
-        channels.AGENT: with_cache("env/*/action", "stats/agent_service"),
+        channels.ENV_SERVER: with_cache("env/*/spec", "env/*/step", "env/*/log", *named("stats/env_server")),
+        channels.AGENT: with_cache("env/*/action", *named("stats/agent_service")),
         channels.LEARNER: with_cache("policy", "window", "stats/learner"),
         channels.RECORDER: with_cache("stats/recorder"),
         OPERATOR: with_cache("stats/launcher"),
@@ -38,9 +43,10 @@ def test_each_role_writes_its_own_channels() -> None:
 
 def test_nobody_answers_for_another() -> None:
     for role in channels.PROCESSES:
-        answers = allowed(role, "put") | {"flush", f"control/{role}"}
+        names = named if role in (channels.ENV_SERVER, channels.AGENT) else lambda key: (key,)
+        answers = allowed(role, "put") | {"flush", *names(f"control/{role}")}
         assert allowed(role, "reply") == allowed(role, "declare_queryable") == answers
-        assert allowed(role, "liveliness_token") == allowed(role, "put") | {f"alive/{role}"}
+        assert allowed(role, "liveliness_token") == allowed(role, "put") | {*names(f"alive/{role}")}
     assert allowed(OPERATOR, "declare_queryable") == with_cache("stats/launcher") | {"flush"}
     assert allowed(OPERATOR, "liveliness_token") == with_cache("stats/launcher")
 

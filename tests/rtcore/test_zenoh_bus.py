@@ -20,7 +20,7 @@ from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, REC
 from rtcore.messages import StepBatch
 from rtcore.monotonic import MonotonicClock
 from rtcore.zenoh_bus import open_bus
-from rtcore.zenoh_config import socket_path
+from rtcore.zenoh_config import Endpoints, socket_path
 from tests.rtcore.bus_child import BATCHES
 from tests.rtcore.bus_samples import ENV, ZenohWorld, batch, collect, eventually, policy, spec, step
 
@@ -256,9 +256,13 @@ def test_further_endpoints_connect_what_shares_no_directory(world: ZenohWorld) -
     elsewhere = world.socket_dir / "b"
     elsewhere.mkdir(0o700)
     with (
-        open_bus(LEARNER, "run", world.socket_dir, clock=CLOCK, listen=[endpoint]) as learner,
-        open_bus(AGENT, "run", elsewhere, clock=CLOCK, connect=[endpoint]) as agent,
-        open_bus(RECORDER, "other", elsewhere, clock=CLOCK, connect=[endpoint]) as stranger,
+        open_bus(
+            LEARNER, "run", world.socket_dir, clock=CLOCK, endpoints=Endpoints(listen=(endpoint,))
+        ) as learner,
+        open_bus(AGENT, "run", elsewhere, clock=CLOCK, endpoints=Endpoints(connect=(endpoint,))) as agent,
+        open_bus(
+            RECORDER, "other", elsewhere, clock=CLOCK, endpoints=Endpoints(connect=(endpoint,))
+        ) as stranger,
     ):
         learner.publisher(POLICY).put(policy(5))
         policies, foreign = agent.latest(POLICY), stranger.latest(POLICY)

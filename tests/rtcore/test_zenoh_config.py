@@ -11,7 +11,7 @@ from rtcore.channels import AGENT, ENV_SERVER, LEARNER, RECORDER
 from rtcore.config import ConfigError
 from rtcore.signing import Identity
 from rtcore.zenoh_access import access_control
-from rtcore.zenoh_config import Security, session_config
+from rtcore.zenoh_config import Endpoints, Security, session_config
 
 SECURITY = Security(
     Identity("learner", Path("/k/cert.pem"), Path("/k/key.pem"), Path("/k/ca.pem")),
@@ -20,7 +20,7 @@ SECURITY = Security(
 
 
 def test_settings_that_no_session_can_be_made_of() -> None:
-    with pytest.raises(ValueError, match=r"role = 'actor': must be one of env_server, agent_service"):
+    with pytest.raises(ValueError, match=r"process = 'actor': must be one of env_server, agent_service"):
         session_config("actor", "run", Path("/tmp"))
     with pytest.raises(ValueError, match="run_name is empty"):
         session_config(AGENT, "", Path("/tmp"))
@@ -29,7 +29,7 @@ def test_settings_that_no_session_can_be_made_of() -> None:
     with pytest.raises(ValueError, match="without any of"):
         session_config(AGENT, "run", Path("/tmp/a#b"))
     with pytest.raises(ValueError, match="endpoint 'localhost:7447': must be like tcp/host:port"):
-        session_config(AGENT, "run", Path("/tmp"), connect=["localhost:7447"])
+        session_config(AGENT, "run", Path("/tmp"), endpoints=Endpoints(connect=("localhost:7447",)))
 
 
 def test_each_role_connects_to_the_earlier_ones() -> None:
@@ -52,7 +52,7 @@ def test_each_role_connects_to_the_earlier_ones() -> None:
 
 def test_protocols_are_those_of_the_endpoints() -> None:
     config = session_config(
-        AGENT, "a b", Path("/s"), connect=["tcp/h:1", "tls/h:2"], listen=["tcp/0.0.0.0:3"]
+        AGENT, "a b", Path("/s"), endpoints=Endpoints(("tcp/h:1", "tls/h:2"), ("tcp/0.0.0.0:3",))
     )
     transport = config["transport"]
     assert isinstance(transport, dict)
@@ -62,7 +62,7 @@ def test_protocols_are_those_of_the_endpoints() -> None:
 
 def test_secured_links_are_tls_alone() -> None:
     config: Any = session_config(
-        LEARNER, "run", Path("/s"), connect=["tls/h:9"], listen=["tls/0.0.0.0:8"], security=SECURITY
+        LEARNER, "run", Path("/s"), endpoints=Endpoints(("tls/h:9",), ("tls/0.0.0.0:8",)), security=SECURITY
     )
     assert config["listen"]["endpoints"] == ["tls/127.0.0.1:3", "tls/0.0.0.0:8"]
     assert config["connect"]["endpoints"] == ["tls/127.0.0.1:1", "tls/127.0.0.1:2", "tls/h:9"]
@@ -83,4 +83,6 @@ def test_secured_links_are_tls_alone() -> None:
 def test_no_other_endpoint_beside_secured_ones(endpoint: str) -> None:
     for where in ("connect", "listen"):
         with pytest.raises(ConfigError, match=rf"^endpoint = '{endpoint}': must be like tls/host:port"):
-            session_config(LEARNER, "run", Path("/s"), security=SECURITY, **{where: [endpoint]})
+            session_config(
+                LEARNER, "run", Path("/s"), security=SECURITY, endpoints=Endpoints(**{where: (endpoint,)})
+            )

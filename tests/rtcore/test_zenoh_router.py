@@ -15,7 +15,7 @@ from rtcore.channels import ENV_SERVER, LEARNER, LOG, POLICY, RECORDER, STATS
 from rtcore.messages import Command, CommandReply
 from rtcore.monotonic import MonotonicClock
 from rtcore.zenoh_bus import ZenohBus, open_bus, open_bus_by_router
-from rtcore.zenoh_config import session_config
+from rtcore.zenoh_config import Endpoints, session_config
 from rtcore.zenoh_router import router_config, through_router
 from rtcore.zenoh_session import open_router
 from tests.rtcore.bus_samples import ENV, batch, collect, eventually, policy, stats
@@ -43,8 +43,12 @@ def peers(endpoint: str) -> Iterator[tuple[ZenohBus, ZenohBus]]:
     with tempfile.TemporaryDirectory(prefix="tn", dir="/tmp") as directory:
         place = Path(directory)
         with (
-            open_bus(ENV_SERVER, RUN, place, clock=MonotonicClock(), connect=[endpoint]) as env,
-            open_bus(LEARNER, RUN, place, clock=MonotonicClock(), connect=[endpoint]) as learner,
+            open_bus(
+                ENV_SERVER, RUN, place, clock=MonotonicClock(), endpoints=Endpoints(connect=(endpoint,))
+            ) as env,
+            open_bus(
+                LEARNER, RUN, place, clock=MonotonicClock(), endpoints=Endpoints(connect=(endpoint,))
+            ) as learner,
         ):
             yield env, learner
 
@@ -80,7 +84,7 @@ def test_who_is_elsewhere_hears_everything_once_and_is_heard(
 
 
 def test_a_peer_settings_become_those_of_a_client_with_one_way_out() -> None:
-    settings = session_config(RECORDER, RUN, Path("/nowhere"), connect=["tls/other:1"])
+    settings = session_config(RECORDER, RUN, Path("/nowhere"), endpoints=Endpoints(connect=("tls/other:1",)))
     client = through_router(settings, "tcp/host:7447")
     assert client["mode"] == "client"
     assert client["listen"] == {"endpoints": []}

@@ -8,20 +8,22 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from launcher import keys
+from rtcore import cast
 from rtcore.bus import BusError
-from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, PROCESSES, RECORDER, SPEC
+from rtcore.channels import ACTION, AGENT, ENV_SERVER, LEARNER, LOG, POLICY, PROCESSES, RECORDER, SPEC, STATS
+from rtcore.config import EnvConfig, RunConfig
 from rtcore.messages import Command, CommandReply, StepBatch
 from rtcore.monotonic import MonotonicClock
 from rtcore.zenoh_bus import ZenohBus, open_bus
 from rtcore.zenoh_session import CLOSE_LIMIT_S, CLOSING
-from tests.rtcore.bus_samples import ENV, ZenohWorld, batch, collect, eventually, policy, spec, step
+from tests.rtcore.bus_samples import ENV, ZenohWorld, batch, collect, eventually, policy, spec, stats, step
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,9 +36,9 @@ class SecuredWorld:
         keys.make(self.keys, now=datetime.now(UTC))
         self.opened: list[ZenohBus] = []
 
-    def bus(self, role: str) -> ZenohBus:
+    def bus(self, process: str, peers: Sequence[str] = PROCESSES) -> ZenohBus:
         clock, secure = MonotonicClock(), str(self.keys)
-        bus = open_bus(role, ZenohWorld.RUN, self.socket_dir, clock=clock, secure=secure)
+        bus = open_bus(process, ZenohWorld.RUN, self.socket_dir, clock=clock, peers=peers, secure=secure)
         self.opened.append(bus)
         return bus
 
@@ -71,6 +73,31 @@ def test_everybody_may_do_what_its_role_does(world: SecuredWorld) -> None:
     for bus in reversed(world.opened):
         bus.close()
     assert time.monotonic() - begin < 2.0
+
+
+def test_a_fleet_meets_under_the_certificates_of_its_roles(world: SecuredWorld) -> None:
+    names = cast.names(RunConfig(env=EnvConfig(count=2)))
+    buses = {name: world.bus(name, names) for name in names}
+    for name, bus in buses.items():
+        bus.declare_alive(name)
+        bus.serve(name, lambda command: CommandReply(id=command.id, ok=True, text="done"))
+    assert eventually(lambda: all(bus.alive() == set(names) for bus in buses.values()))
+    operator = world.bus("client", names)
+    assert all(operator.ask(name, Command(id=name, verb="status")).ok for name in names)
+    reader = buses[RECORDER].queue(STATS, "*")
+    mine = buses["agent_service.1"].publisher(STATS, "agent_service.1")
+    foreign = buses["agent_service.1"].publisher(STATS, "env_server.1")
+    heard: set[str] = set()
+
+    def both_told() -> bool:
+        foreign.put(stats("env_server.1"))
+        mine.put(stats("agent_service.1"))
+        reader.wait(0.2)
+        heard.update(one.message.process for one in reader.drain())
+        return bool(heard)
+
+    assert eventually(both_told) and not eventually(lambda: both_told() and len(heard) > 1, 0.3)
+    assert heard == {"agent_service.1"}
 
 
 def test_what_is_not_its_own_goes_nowhere(world: SecuredWorld) -> None:

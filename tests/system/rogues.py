@@ -151,7 +151,9 @@ def replayed_to_a_new_agent(scene: Scene) -> int:
 
 def tampered_file(scene: Scene) -> int:
     """Comes last: the agent has no policy then."""
-    scene.run.adopted_path.write_bytes(msgspec.msgpack.encode(replace(scene.policy(3), version=9)))
+    scene.run.adopted_path(channels.AGENT).write_bytes(
+        msgspec.msgpack.encode(replace(scene.policy(3), version=9))
+    )
     restart_agent(scene)
     return 0
 
