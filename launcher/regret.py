@@ -2,7 +2,8 @@
 
 In a finite world R_t and P_t are known, and so V*_t and the value of every policy that acted. A unit's
 regret is V*_t - V^pi_t, infinite horizon, discounted with `learner.gamma`, of the policy pi that acted; the
-mean over the unit's ticks, if several did (paper, section 3; by phase, section 5.1).
+mean over the unit's ticks, if several did (paper, section 3; by phase, section 5.1). The environments of a
+fleet are one world at one unit: the ticks are those of all.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The arrays behind a replay: in memory, or mapped from files whose place on the disk is taken ahead."""
+"""The arrays behind a replay, in memory or mapped from files whose place on the disk is taken ahead.
+
+And those that a draw from it fills.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,28 @@ class Columns:
     next_observation: Floats
     terminated: Bools
     unit: NDArray[np.int32]  # t, rises with insertion
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """B transitions, in arrays that `Replay.sample` fills anew each time."""
+
+    observation: Floats  # [B, observation_dim]
+    action: Floats  # [B, action_dim], in [-1, 1]
+    reward: Floats  # [B], per tick
+    next_observation: Floats  # [B, observation_dim]
+    terminated: Bools  # [B]: bootstrap with 0; a truncated transition is not terminated
+
+
+def make_batch(size: int, observation_dim: int, action_dim: int) -> Batch:
+    """Zeroed arrays for `size` transitions."""
+    return Batch(
+        observation=np.zeros((size, observation_dim), np.float32),
+        action=np.zeros((size, action_dim), np.float32),
+        reward=np.zeros(size, np.float32),
+        next_observation=np.zeros((size, observation_dim), np.float32),
+        terminated=np.zeros(size, np.bool_),
+    )
 
 
 def in_memory(rows: int, observation_dim: int, action_dim: int) -> Columns:

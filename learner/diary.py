@@ -8,130 +8,44 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from learner.entries import (
+    FALLBACK,
+    LENGTH_BYTES,
+    NAME,
+    Acted,
+    ActedIn,
+    Contents,
+    Entered,
+    Entry,
+    Forecast,
+    Published,
+    read,
+)
 from rtcore.clock import Clock
 from rtcore.ledger import Ledger
-from rtcore.messages import Phase, Policy, Spec, Step, WindowNotice
+from rtcore.messages import Policy, Spec, Step, WindowNotice
 from rtcore.weights import unpack
 from rtcore.windows import Window
 
-NAME = "diary.msgpack"  # in the learner's directory
-FALLBACK = -1  # in place of a policy's version: nobody's answer acted
+__all__ = [
+    "FALLBACK", "NAME", "Acted", "ActedIn", "Contents", "Entered", "Entry", "Forecast", "Published", "read",
+]  # fmt: skip
+
 # A unit may be long: what a kill takes along is one unit, or so many ticks if they are fewer.
 MOST_TICKS = 1000
-_LENGTH_BYTES = 4  # in front of each entry, little-endian
-
-
-class _Entry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """New fields go last and have defaults."""
-
-
-class Published(_Entry, frozen=True, kw_only=True, tag="policy"):
-    """A policy went out."""
-
-    version: int
-    window: int
-    iterate: int
-    created_ns: int
-    states: int
-    actions: int
-    table: bytes  # float32 [states, actions], little-endian: the probabilities as agents got them
-
-    @property
-    def probability(self) -> NDArray[np.float64]:
-        """[S, A], as an agent draws from it: rows that sum to 1."""
-        table = np.frombuffer(self.table, "<f4").reshape(self.states, self.actions).astype(np.float64)
-        rows: NDArray[np.float64] = table / table.sum(-1, keepdims=True)
-        return rows
-
-
-class Forecast(_Entry, frozen=True, kw_only=True, tag="window"):
-    """A window was entered by a learner that improves its policy towards a forecast."""
-
-    window: int
-    start: int  # t_m
-    update: int
-    hold: int | None
-    unit: int  # t_m, or where it was entered late
-    states: int
-    actions: int
-    forecast: bytes  # float64 [states, actions], little-endian: Qtilde as it is used
-    log_policy: bytes  # likewise: log pi, before the window's first iteration
-
-    def tables(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Qtilde and log pi, [S, A] each."""
-        shape = (self.states, self.actions)
-        forecast, log_policy = (
-            np.frombuffer(data, "<f8").reshape(shape) for data in (self.forecast, self.log_policy)
-        )
-        return forecast, log_policy
-
-
-class Entered(_Entry, frozen=True, kw_only=True, tag="phase"):
-    """A phase began, by the schedule or by an operator's order."""
-
-    window: int
-    phase: Phase
-    run_ns: int  # since T0
-
-
-class Acted(_Entry, frozen=True, kw_only=True, tag="acted"):
-    """Ticks of one unit, by the policy that acted; a unit may have several entries, which add up."""
-
-    incarnation: int  # of the env server
-    next_seq: int  # of its first step that is in no entry yet
-    unit: int
-    ticks: dict[int, int]  # by version, `FALLBACK` for misses
-
-
-Entry = Published | Forecast | Entered | Acted
-_DECODER = msgspec.msgpack.Decoder(Entry)
-
-
-class Contents(NamedTuple):
-    """A diary, read."""
-
-    entries: list[Entry]
-    torn: int  # 1: something follows that is no whole entry, as a kill or a full disk leaves it
-    size: int  # bytes of the whole entries
-
-
-def read(path: Path) -> Contents:
-    """All whole entries of a diary; nothing if there is none.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return Contents([], 0, 0)
-    entries: list[Entry] = []
-    size = 0
-    while size < len(data):
-        begin = size + _LENGTH_BYTES
-        end = begin + int.from_bytes(data[size:begin], "little")
-        try:
-            entry = _DECODER.decode(data[begin:end]) if end <= len(data) else None
-        except (ValueError, RecursionError):
-            entry = None
-        if entry is None:
-            break
-        entries.append(entry)
-        size = end
-    return Contents(entries, int(size < len(data)), size)
 
 
 class Tally:
-    """Counts ticks by policy, unit by unit. Pure.
+    """Counts one environment's ticks by policy, unit by unit. Pure.
 
     Args:
         position: (incarnation, seq) before which everything is counted already.
@@ -200,16 +114,18 @@ class Diary:
         self._clock, self._ledger = clock, ledger
         self._waiting: SimpleQueue[Entry] = SimpleQueue()
         self._writing = threading.Lock()
-        self._tally: Tally | None = None
+        self._tallies: dict[str, Tally] = {}  # by environment; none in a continuous world
         self._size = self._t0_ns = 0
 
     @property
-    def pending(self) -> Acted | None:
-        """What was lived and is not written yet: give it to `meet` of a later learner."""
-        return None if self._tally is None else self._tally.pending
+    def pending(self) -> dict[str, Acted]:
+        """What was lived and is not written yet, by environment: give it to `meet` of a later learner."""
+        found = {env: tally.pending for env, tally in self._tallies.items()}
+        return {env: pending for env, pending in found.items() if pending is not None}
 
-    def meet(self, spec: Spec, pending: Acted | None = None) -> None:
-        """Learn what world it is; go on after what an earlier learner of the run wrote or had `pending`."""
+    def meet(self, spec: Spec, envs: Collection[str], pending: Mapping[str, Acted]) -> None:
+        """Learn what world it is, and the environments of the run; go on after what an earlier learner of it
+        wrote or had `pending`."""
         if not spec.states:
             return
         try:
@@ -219,17 +135,22 @@ class Diary:
             return
         self._ledger.count("diary.torn", found.torn)
         self._size, self._t0_ns = found.size, spec.t0_ns
-        told = ((one.incarnation, one.next_seq) for one in found.entries if isinstance(one, Acted))
-        self._tally = Tally(max(told, default=(-1, 0)), pending)
+        told = dict.fromkeys(envs, (-1, 0))
+        for one in found.entries:
+            if isinstance(one, Acted):
+                env = one.env if isinstance(one, ActedIn) else next(iter(envs))
+                told[env] = max(told.get(env, (-1, 0)), (one.incarnation, one.next_seq))
+        self._tallies = {env: Tally(told[env], pending.get(env)) for env in envs}
 
     def acted(self, steps: Sequence[Step]) -> None:
-        """Count what was lived, each step once and in order; write what is not `pending` any more."""
-        if self._tally is not None:
-            self._put(self._tally.take(steps), at_once=True)
+        """Count what was lived, each step once and those of an environment in order; write what is not
+        `pending` any more."""
+        for env, tally in self._tallies.items():
+            self._tell(env, tally.take([step for step in steps if step.env == env]))
 
     def window(self, window: Window, unit: int, algorithm: object) -> None:
         """A window was entered in `unit`, and `algorithm` has begun it."""
-        if self._tally is None or not isinstance(algorithm, Forecasting):
+        if not self._tallies or not isinstance(algorithm, Forecasting):
             return
         tables = algorithm.window_start()
         if tables is not None:
@@ -243,7 +164,7 @@ class Diary:
 
     def sent(self, message: Policy | WindowNotice) -> None:
         """A policy or a notice went out."""
-        if self._tally is None:
+        if not self._tallies:
             return
         if isinstance(message, WindowNotice):
             run_ns = message.at_ns - self._t0_ns
@@ -259,8 +180,8 @@ class Diary:
 
     def finish(self) -> None:
         """Nothing more will be lived: write what is left."""
-        if self._tally is not None:
-            self._put(self._tally.finish(), at_once=True)
+        for env, tally in self._tallies.items():
+            self._tell(env, tally.finish())
 
     def flush(self) -> None:
         """Write all that waits. For any thread."""
@@ -272,16 +193,23 @@ class Diary:
                     return
                 self._write(entry)
 
-    def _put(self, entries: Sequence[Entry], *, at_once: bool = False) -> None:
+    def _tell(self, env: str, told: Sequence[Acted]) -> None:
+        """Write the ticks of one environment, with its name if there are others."""
+        if not told:
+            return
+        if len(self._tallies) > 1:
+            told = [ActedIn(env=env, **msgspec.structs.asdict(one)) for one in told]
+        self._put(told)
+        self.flush()
+
+    def _put(self, entries: Sequence[Entry]) -> None:
         for entry in entries:
             self._waiting.put(entry)
-        if at_once and entries:
-            self.flush()
 
     def _write(self, entry: Entry) -> None:
         """Append one entry whole, or leave the file as it was."""
         body = msgspec.msgpack.encode(entry)
-        data = len(body).to_bytes(_LENGTH_BYTES, "little") + body
+        data = len(body).to_bytes(LENGTH_BYTES, "little") + body
         try:
             with self._path.open("ab", buffering=0) as file:
                 file.truncate(self._size)  # a kill or a full disk may have left a part of an entry

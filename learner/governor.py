@@ -1,6 +1,6 @@
 """When the learner gives way to the tick, and when it takes its power back. Pure.
 
-The evidence is in the log: how much of its period each tick had used when the agent's answer was there,
+The evidence is in the logs: how much of its period each tick had used when the agent's answer was there,
 and which deadlines were lost for want of a processor. The learner gives way at once, by half each time:
 first threads, which pay least (a second one on two cores: from 96 down to 57 updates a second beside a
 500 Hz loop, and four times the misses), then its share of the time. It comes back one level at a time,
@@ -13,7 +13,7 @@ without fare as badly, it is not the learner who does it, and giving way would b
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -123,28 +123,85 @@ class Evidence:
         tally.lost += sign * lost
 
 
-class Governor:
-    """Feeds on the log, and decides on the learner's power.
+@dataclass(slots=True)
+class Loop:
+    """One agent's ticks since the power changed last, and what the learner did beside them."""
 
-    Begins with one thread: a learner of several earns the others. Time is counted in ticks that come in
-    the log, so without an env server the power stays as it is.
+    tick_ns: int
+    evidence: Evidence
+    clean: int = 0  # busy ticks since the last change or trouble
+    risen_for: int | None = None  # ticks since power was taken back; None: it was given up since
+    rest: int = 0  # ticks for which giving way is known to be in vain
+    excused_share: float = 0.0  # of tight ticks without the learner, as it was found then
+    _previous: Step | None = None
+    _previous_lost: bool = False
+    _work: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=4096))  # (begin, end)
+
+    def worked(self, begin_ns: int, end_ns: int) -> None:
+        """The learner computed from `begin_ns` to `end_ns`."""
+        if self._work and begin_ns - self._work[-1][1] < self.tick_ns:
+            begin_ns = self._work.pop()[0]
+        self._work.append((begin_ns, end_ns))
+
+    def take(self, step: Step, since_ns: int) -> None:
+        """The next step of the log. What began before `since_ns` is no evidence."""
+        previous, self._previous = self._previous, step
+        used = None if previous is None else self._used(previous, step)
+        lost = used is not None and (step.missed or step.skipped > 0)
+        begins, self._previous_lost = lost and not self._previous_lost, lost
+        if previous is None or used is None or previous.due_ns < since_ns:
+            return
+        busy = self._was_busy(previous.due_ns, max(step.due_ns, step.woke_ns))
+        if self.risen_for is not None:
+            self.risen_for += 1
+        self.evidence.add(used, lost=begins, busy=busy)
+        if self.rest:
+            self.rest -= 1
+        else:
+            self.clean += busy
+
+    def begin_anew(self) -> None:
+        """The power has changed: evidence from before counts no more."""
+        self.clean = 0
+        self.evidence = Evidence(self.evidence.size)
+
+    def _used(self, previous: Step, step: Step) -> float | None:
+        """Share of the period that had passed when the answer was there; None: this tick says nothing."""
+        follows = step.incarnation == previous.incarnation and step.seq == previous.seq + 1
+        if not follows or step.episode_tick == 0:  # a reset waits for no answer
+            return None
+        if step.missed and step.cause not in LEARNER_MAY_CAUSE:
+            return None
+        if step.missed or step.skipped:
+            return 1.0
+        if step.loop_ns < 0:
+            return None
+        return (previous.sent_ns + step.loop_ns - previous.due_ns) / self.tick_ns
+
+    def _was_busy(self, begin_ns: int, end_ns: int) -> bool:
+        while self._work and self._work[0][1] <= begin_ns:
+            self._work.popleft()  # steps come in order: nobody asks about it again
+        return bool(self._work) and self._work[0][0] < end_ns
+
+
+class Governor:
+    """Feeds on the logs, and decides on the learner's power.
+
+    Begins with one thread: a learner of several earns the others. Of several agents each is watched by
+    itself: the learner gives way to whichever is in trouble, and takes power back when none has been for a
+    while. Time is counted in ticks that come in the logs, so without an env server the power stays as it is,
+    and one of several that is gone says nothing.
     """
 
-    def __init__(self, threads: int, tick_ns: int) -> None:
+    def __init__(self, threads: int, tick_ns: int, envs: Collection[str]) -> None:
+        """`envs`: the environments' names, as in their steps."""
         self._tick_ns = tick_ns
         self._levels = ladder(threads)
         self._careful = len(self._levels) - len(DUTIES)  # the level of one thread at full duty
         self._level = self._careful
         self._changed_ns = 0  # evidence from before counts no more
-        self._evidence = Evidence(self._in_ticks(WINDOW_S))
-        self._clean = 0  # busy ticks since the last change or trouble
+        self._loops = {env: Loop(tick_ns, Evidence(self._in_ticks(WINDOW_S))) for env in envs}
         self._patience_s = MIN_PATIENCE_S
-        self._risen_for: int | None = None  # ticks since power was taken back; None: it was given up since
-        self._rest = 0  # ticks for which giving way is known to be in vain
-        self._excused_share = 0.0  # of tight ticks without the learner, as it was found then
-        self._previous: Step | None = None
-        self._previous_lost = False
-        self._work: deque[tuple[int, int]] = deque(maxlen=4096)  # (begin, end) of what the learner did
 
     @property
     def power(self) -> Power:
@@ -158,77 +215,56 @@ class Governor:
 
     @property
     def load(self) -> float:
-        """99th percentile, over the last seconds, of the share of the period used up to the answer."""
-        return self._evidence.load()
+        """99th percentile, over the last seconds, of the share of the period used up to the answer: that of
+        the agent for which it is highest."""
+        return max(loop.evidence.load() for loop in self._loops.values())
 
     def worked(self, begin_ns: int, end_ns: int) -> None:
         """The learner computed from `begin_ns` to `end_ns`. Call it in order, before the ticks in it come."""
-        if self._work and begin_ns - self._work[-1][1] < self._tick_ns:
-            begin_ns = self._work.pop()[0]
-        self._work.append((begin_ns, end_ns))
+        for loop in self._loops.values():
+            loop.worked(begin_ns, end_ns)
 
     def feed(self, steps: Iterable[Step], now_ns: int) -> Decision | None:
-        """Take the next steps of the log, in order; return what is decided at `now_ns`, if anything is."""
+        """Take the next steps of the logs, those of each in order; return what is decided at `now_ns`, if
+        anything is."""
+        fed: dict[str, Loop] = {}
         for step in steps:
-            self._take(step)
-        if self._rest > 0 and not self._evidence.worse_than(2 * self._excused_share):
-            return None
-        self._rest = 0
-        if self._evidence.troubled:
-            return self._give_way(now_ns)
-        if self.limited and self._clean >= self._in_ticks(self._patience_s) * self.power.duty:
-            self._risen_for = 0
+            loop = fed[step.env] = self._loops[step.env]
+            loop.take(step, self._changed_ns)
+        awake = [loop for loop in fed.values() if not self._rests(loop)]
+        for loop in awake:
+            if loop.evidence.troubled:
+                return self._give_way(loop, now_ns)
+        patience = self._in_ticks(self._patience_s) * self.power.duty
+        if self.limited and any(loop.clean >= patience for loop in awake):
+            for loop in self._loops.values():
+                loop.risen_for = 0
             return self._go_to(self._level - 1, now_ns, f"{self._patience_s:g} s without trouble")
         return None
 
-    def _take(self, step: Step) -> None:
-        previous, self._previous = self._previous, step
-        used = None if previous is None else self._used(previous, step)
-        lost = used is not None and (step.missed or step.skipped > 0)
-        begins, self._previous_lost = lost and not self._previous_lost, lost
-        if previous is None or used is None or previous.due_ns < self._changed_ns:
-            return
-        busy = self._was_busy(previous.due_ns, max(step.due_ns, step.woke_ns))
-        if self._risen_for is not None:
-            self._risen_for += 1
-        self._evidence.add(used, lost=begins, busy=busy)
-        if self._rest:
-            self._rest -= 1
-        else:
-            self._clean += busy
+    def _rests(self, loop: Loop) -> bool:
+        if loop.rest > 0 and not loop.evidence.worse_than(2 * loop.excused_share):
+            return True
+        loop.rest = 0
+        return False
 
-    def _used(self, previous: Step, step: Step) -> float | None:
-        """Share of the period that had passed when the answer was there; None: this tick says nothing."""
-        follows = step.incarnation == previous.incarnation and step.seq == previous.seq + 1
-        if not follows or step.episode_tick == 0:  # a reset waits for no answer
-            return None
-        if step.missed and step.cause not in LEARNER_MAY_CAUSE:
-            return None
-        if step.missed or step.skipped:
-            return 1.0
-        if step.loop_ns < 0:
-            return None
-        return (previous.sent_ns + step.loop_ns - previous.due_ns) / self._tick_ns
-
-    def _was_busy(self, begin_ns: int, end_ns: int) -> bool:
-        while self._work and self._work[0][1] <= begin_ns:
-            self._work.popleft()  # steps come in order: nobody asks about it again
-        return bool(self._work) and self._work[0][0] < end_ns
-
-    def _give_way(self, now_ns: int) -> Decision | None:
-        evidence = self._evidence
-        self._clean = 0
+    def _give_way(self, loop: Loop, now_ns: int) -> Decision | None:
+        """To the agent of that loop."""
+        evidence = loop.evidence
+        for one in self._loops.values():
+            one.clean = 0
         if evidence.in_vain:
             busy, idle = evidence.busy.tight_share, evidence.idle.tight_share
-            self._rest, self._excused_share = self._in_ticks(REST_S), idle
+            loop.rest, loop.excused_share = self._in_ticks(REST_S), idle
             reason = f"giving way would not help: {busy:.1%} of the ticks tight beside it, {idle:.1%} without"
             return self._go_to(min(self._level, self._careful), now_ns, reason)
         if self._level == len(self._levels) - 1:
             return None
-        if self._risen_for is not None:
-            soon = self._risen_for < self._in_ticks(self._patience_s + WINDOW_S)
+        if loop.risen_for is not None:
+            soon = loop.risen_for < self._in_ticks(self._patience_s + WINDOW_S)
             self._patience_s = min(2 * self._patience_s, MAX_PATIENCE_S) if soon else MIN_PATIENCE_S
-        self._risen_for = None
+        for one in self._loops.values():
+            one.risen_for = None
         misses = evidence.busy.lost
         reason = f"p99 of the loop took {evidence.load():.0%} of the period, deadlines lost {misses} times"
         return self._go_to(self._level + 1, now_ns, reason)
@@ -236,8 +272,8 @@ class Governor:
     def _go_to(self, level: int, now_ns: int, reason: str) -> Decision:
         self._level = level
         self._changed_ns = now_ns
-        self._clean = 0
-        self._evidence = Evidence(self._evidence.size)
+        for loop in self._loops.values():
+            loop.begin_anew()
         return Decision(self.power, f"{self.power.describe(self._levels[0].threads)}: {reason}")
 
     def _in_ticks(self, seconds: float) -> int:

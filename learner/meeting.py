@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from learner.place import Place
 from learner.replay import Replay, ReplayError, open_replay
 from learner.resume import Budget, Published
 from learner.store import MARKS
+from rtcore.cast import env_names
 from rtcore.clock import Clock
 from rtcore.config import RunConfig
 from rtcore.files import sweep
@@ -55,20 +57,22 @@ def meet(
         ConfigError: something does not fit, and `learner.on_mismatch` is "refuse".
     """
     learner, fresh = config.learner, config.learner.on_mismatch == "fresh"
+    envs = env_names(config.env)
 
     def tell(text: str) -> None:
         ledger.event(clock.now_ns(), "WARN", text)
 
     def load() -> tuple[Replay, Place]:
-        found = open_replay(directory, learner.replay_capacity, spec.observation_dim, spec.action_dim)
-        return found, _place(found.committed)
+        dims = spec.observation_dim, spec.action_dim
+        found = open_replay(directory, learner.replay_capacity, *dims, envs=len(envs))
+        return found, _place(found.committed, envs)
 
     for name in ("", resume.REPLAY_DIR, resume.CHECKPOINT_DIR):
         sweep(run_dir.learner_dir / name)
     directory = run_dir.learner_dir / resume.REPLAY_DIR
     (replay, place), _ = resume.fitting(load, directory, fresh=fresh, tell=tell)
     if replay.committed is None or not replay.committed.note:
-        place = _left(directory)
+        place = _left(directory, envs)
     seed = config.seed * 10 + LEARNER_STREAM
     algorithm = make_algorithm(config, Spaces.of(spec), seed, replay)
     directory = run_dir.learner_dir / resume.CHECKPOINT_DIR
@@ -93,20 +97,25 @@ def meet(
     return Beginning(replay, algorithm, place, counted, published, settled)
 
 
-def _left(directory: Path) -> Place:
+def _left(directory: Path, envs: Collection[str]) -> Place:
     """Where the run stands, for a replay that nothing was committed to: where the one ended that the disk
     does not give back, or that was set aside last. What came until then is neither learned again nor lost."""
     for path in (directory, *resume.set_aside(directory)):
         record = peek(path / MARKS)
         if record is not None and record.note:
             with suppress(ReplayError):
-                return _place(record)
+                return _place(record, envs)
             break
-    return Place()
+    return Place.beginning(envs)
 
 
-def _place(record: Record | None) -> Place:
+def _place(record: Record | None, envs: Collection[str]) -> Place:
+    if record is None or not record.note:
+        return Place.beginning(envs)
     try:
-        return Place.decode(b"" if record is None else record.note)
+        place = Place.decode(record.note)
     except ValueError as error:
         raise ReplayError(f"the replay's place in the log is not readable: {error}") from error
+    if place.envs.keys() != set(envs):
+        raise ReplayError(f"the replay is of {', '.join(place.envs)} (wanted {', '.join(envs)})")
+    return place

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 from learner.governor import Governor, Power
@@ -38,9 +38,9 @@ class Levers:
 class PowerControl:
     """Sets the learner's threads and cores, and the pause after each piece of work.
 
-    Counts `governor.decisions`, `governor.ticks` (those that came in the log) and `governor.limited_ticks`
+    Counts `governor.decisions`, `governor.ticks` (those that came in the logs) and `governor.limited_ticks`
     (with less than full power). The gauges are `governor/threads`, `governor/duty` and `governor/load`:
-    the share of its period that the loop took, 99th percentile of the last seconds.
+    the share of its period that the loop took, 99th percentile of the last seconds, of a fleet's worst loop.
     """
 
     def __init__(self, config: LearnerConfig, levers: Levers | None, ledger: Ledger) -> None:
@@ -51,19 +51,19 @@ class PowerControl:
         self._governor: Governor | None = None
         self._pause_ends_ns = 0
 
-    def meet(self, tick_ns: int, now_ns: int) -> None:
-        """The environment's control period is known: begin to govern, if that is wanted."""
+    def meet(self, tick_ns: int, envs: Collection[str], now_ns: int) -> None:
+        """The environments and their control period are known: begin to govern, if that is wanted."""
         if self._levers is None or self._config.governor == "off":
             return
         threads = min(self._config.threads, len(self._levers.cores))  # more would wait for each other
-        self._governor = Governor(threads, tick_ns)
+        self._governor = Governor(threads, tick_ns, envs)
         power = self._governor.power
         cores = ", ".join(map(str, self._levers.cores_for(power.threads)))
         self._ledger.event(now_ns, "INFO", f"governor: begins with {power.describe(threads)}, core {cores}")
         self._use(power, now_ns)
 
     def watch(self, steps: Sequence[Step], now_ns: int) -> None:
-        """Take the next steps of the log, and do what follows from them."""
+        """Take the next steps of the logs, and do what follows from them."""
         if self._governor is None or not steps:
             return
         self._ledger.count("governor.ticks", len(steps))

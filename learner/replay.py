@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
-from learner.columns import Bools, Columns, Floats, in_memory
+from learner.columns import Batch, Columns, Floats, in_memory, make_batch
 from learner.marks import Record
 from learner.recency import RecentUnits, Units
 from learner.store import Store
@@ -24,28 +24,6 @@ __all__ = ["Batch", "Columns", "Floats", "Replay", "ReplayError", "make_batch", 
 
 class ReplayError(ValueError):
     """A stored replay does not fit: says every difference on one line."""
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """B transitions, in arrays that `Replay.sample` fills anew each time."""
-
-    observation: Floats  # [B, observation_dim]
-    action: Floats  # [B, action_dim], in [-1, 1]
-    reward: Floats  # [B], per tick
-    next_observation: Floats  # [B, observation_dim]
-    terminated: Bools  # [B]: bootstrap with 0; a truncated transition is not terminated
-
-
-def make_batch(size: int, observation_dim: int, action_dim: int) -> Batch:
-    """Zeroed arrays for `size` transitions."""
-    return Batch(
-        observation=np.zeros((size, observation_dim), np.float32),
-        action=np.zeros((size, action_dim), np.float32),
-        reward=np.zeros(size, np.float32),
-        next_observation=np.zeros((size, observation_dim), np.float32),
-        terminated=np.zeros(size, np.bool_),
-    )
 
 
 class Replay:
@@ -269,7 +247,13 @@ class Replay:
 
 
 def open_replay(
-    directory: Path, capacity: int, observation_dim: int, action_dim: int, *, boot: str | None = None
+    directory: Path,
+    capacity: int,
+    observation_dim: int,
+    action_dim: int,
+    *,
+    envs: int = 1,
+    boot: str | None = None,
 ) -> Replay:
     """The replay in `directory` with all that was committed to it; an empty one if there is none.
 
@@ -280,15 +264,15 @@ def open_replay(
         capacity: transitions held.
         observation_dim: of the world.
         action_dim: of the world.
+        envs: environments whose place in the log is committed with the rows.
         boot: of the host; None: this one. After another one only what was synced counts.
 
     Raises:
         ReplayError: the one there has another capacity or other dimensions, is damaged, or older.
     """
     try:
-        store = Store.open(
-            directory, capacity, observation_dim, action_dim, this_boot() if boot is None else boot
-        )
+        boot = this_boot() if boot is None else boot
+        store = Store.open(directory, capacity, observation_dim, action_dim, boot, envs)
     except OSError as error:
         replay = Replay(capacity, observation_dim, action_dim)
         replay.fault = error

@@ -23,7 +23,7 @@ from learner.conductor import (
     WindowEntered,
 )
 from learner.gauges import Gauges
-from learner.intake import Intake, Taken
+from learner.intakes import Intakes, Taken
 from learner.keeper import Keeper
 from learner.orders import Orders
 from learner.outbox import Outbox
@@ -31,9 +31,8 @@ from learner.place import Course
 from learner.power import Levers, PowerControl
 from learner.publication import Publication
 from learner.schedule.scheduler import Scheduler
-from rtcore import channels
-from rtcore.admission import is_same_world
 from rtcore.bus import Bus
+from rtcore.cast import env_names
 from rtcore.clock import Clock
 from rtcore.config import TABULAR, RunConfig
 from rtcore.ledger import Ledger
@@ -43,13 +42,13 @@ from rtcore.run_dir import RunDir
 from rtcore.signing import Signer
 
 IDLE_WAIT_S = 0.02  # nothing to learn from: wait so long for the next batch (they come every 50 ms)
-DRAIN_LIMIT_S = 2.0  # after the stop: wait so long for the env server's last batch
+DRAIN_LIMIT_S = 2.0  # after the stop: wait so long for the env servers' last batches
 LEAD_FLOOR_NS = 50_000_000  # publish at least so long before the unit ends, or a quarter of a shorter unit
 COUNTED = ("gradient_steps", "policy_steps", "unread")  # of the algorithm, into the ledger
 
 
 class LearnerService:
-    """Trains on the log of one environment."""
+    """Trains on the logs of all environments of a run."""
 
     def __init__(
         self,
@@ -67,9 +66,8 @@ class LearnerService:
         self._run_dir = run_dir
         self._clock = clock
         self._ledger = ledger
-        self._specs = bus.latest(channels.SPEC, config.env.name)
         self.outbox = Outbox(bus, run_dir, clock, ledger, signer)
-        self._intake = Intake(bus, config.env.name, clock, ledger, self.outbox.diary)
+        self._intake = Intakes(bus, env_names(config.env), clock, ledger, self.outbox.diary)
         directory = run_dir.learner_dir / resume.CHECKPOINT_DIR
         self.keeper = Keeper(directory, config.learner.checkpoint_s, clock, ledger)
         kept = run_dir.learner_dir / resume.SCHEDULE_FILE
@@ -87,7 +85,7 @@ class LearnerService:
         self._lead_ns = self._lead_floor_ns = LEAD_FLOOR_NS
 
     def run(self, stop: Stop) -> None:
-        """Learn until stopped, then take what the env server still sends."""
+        """Learn until stopped, then take what the env servers still send."""
         while not stop.is_set():
             self._ledger.beat(self._clock.now_ns())
             if self._spec is None:
@@ -141,11 +139,11 @@ class LearnerService:
     # ---- turning the crank
 
     def _take_in(self) -> None:
-        declared = self._specs.take()
-        if declared is not None:
-            self._meet(declared.message)
         if self._spec is None:
-            return
+            spec = self._intake.declared()
+            if spec is None:
+                return
+            self._meet(spec)
         now_ns = self._clock.now_ns()
         self._power.watch(self._learn_from(self._intake.take(now_ns)), now_ns)
 
@@ -177,18 +175,13 @@ class LearnerService:
         self._note_duration(self._clock.now_ns() - begin_ns)
 
     def _meet(self, spec: Spec) -> None:
-        if self._spec is not None:
-            if spec.incarnation != self._spec.incarnation and is_same_world(spec, self._spec):
-                text = "the env server came back; units and windows go on by its first clock"
-                self._ledger.event(self._clock.now_ns(), "WARN", text)
-            return
         found = meeting.meet(
             self._config, self._run_dir, spec, self._budget, self._clock, self._ledger
         )  # or it ends here: what does not fit stays as it is
         self._ledger.beat(self._clock.now_ns())  # what earlier ones left may take long to load
         self._spec, self._algorithm = spec, found.algorithm
         self._lead_ns = self._lead_floor_ns = min(LEAD_FLOOR_NS, spec.unit_ns // 4)
-        self._power.meet(spec.tick_ns, self._clock.now_ns())
+        self._power.meet(spec.tick_ns, self._intake.envs, self._clock.now_ns())
         self._intake.meet(spec, found.replay, found.place, found.counted)
         self.keeper.meet(found.replay)
         self._conductor.go_on_from(found.settled, paused=found.place.course.paused)

@@ -19,7 +19,7 @@ from rtcore.files import write_atomic
 
 MARGIN = 1024  # rows between two commits, at most
 SCHEMA = 3  # 2: the cursor was written at the end alone
-_NOTE_BYTES = 4096  # beside an observation
+_NOTE_BYTES = 4096  # of each environment, beside an observation
 _MOST_RESERVED = 1 << 16  # rows; the oldest so many are given up when the host ends
 MARKS, _SYNCED, _OLD_CURSOR = "marks.bin", "synced.bin", "cursor.json"
 
@@ -59,8 +59,17 @@ class Store:
         return self._marks.newest
 
     @classmethod
-    def open(cls, directory: Path, capacity: int, observation_dim: int, action_dim: int, boot: str) -> Store:
-        """The files in `directory`, which are made if there are none.
+    def open(
+        cls,
+        directory: Path,
+        capacity: int,
+        observation_dim: int,
+        action_dim: int,
+        boot: str,
+        envs: int = 1,
+    ) -> Store:
+        """The files in `directory`, which are made if there are none. The note that goes with a commit has
+        room for the places in the logs of `envs` environments.
 
         Raises:
             ValueError: they are of another shape, damaged, or of an older version.
@@ -78,7 +87,7 @@ class Store:
             "observation_dim": observation_dim,
             "action_dim": action_dim,
         }
-        marks = Marks.open(path, shape, _NOTE_BYTES + 4 * observation_dim)
+        marks = Marks.open(path, shape, envs * (_NOTE_BYTES + 4 * observation_dim))
         mapped = MappedColumns.open(directory, rows, observation_dim, action_dim, new=marks.newest.added == 0)
         synced = _read(directory / _SYNCED)
         if marks.newest.boot != boot:

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from learner import checkpoint, diary, marks
 from learner.checkpoint import CheckpointError, State
 from learner.place import Place as LearnerPlace
+from learner.place import Progress
 from learner.schedule.timetable import Timetable
-from recorder.place import Kept, Place, PlaceFile
+from recorder.place import EnvPlace, Kept, Place, PlaceFile
 from rtcore import epoch, tally
 from rtcore.codec import Rejections
 from rtcore.commands import CommandClient, CommandServer
@@ -127,7 +128,7 @@ def replay_marks(path: Path) -> Decoder:
 
 def recorder_place(path: Path) -> Decoder:
     place = PlaceFile(path)
-    place.keep(Kept(1, 2, Place(log=(3, 4), placements={"learner": "core 1"})))
+    place.keep(Kept(1, 2, Place({"env0": EnvPlace((3, 4))}, {"learner": "core 1"})))
     place.close()
     return Decoder(file(path, lambda found: PlaceFile(found).read()), path.read_bytes())
 
@@ -164,7 +165,9 @@ def decoders(path: Path) -> dict[str, Decoder]:
         "timetable": timetables(),
         "marks": replay_marks(path / "marks"),
         "learner_place": Decoder(
-            LearnerPlace.decode, LearnerPlace(previous=bus_samples.step(3)).encode(), (ValueError,)
+            LearnerPlace.decode,
+            LearnerPlace(envs={"env0": Progress(previous=bus_samples.step(3))}).encode(),
+            (ValueError,),
         ),
         "recorder_place": recorder_place(path / "place"),
         "command": commands(),

@@ -22,7 +22,7 @@ from rich.console import Console
 from launcher import bounds, regret, report
 from launcher.summary import summarise
 from learner import diary
-from learner.diary import Acted, Entered, Entry, Forecast, Published
+from learner.diary import Acted, ActedIn, Entered, Entry, Forecast, Published
 from learner.tabular.table import npg_step
 from learner.theory import certificates
 from learner.theory.certificates import Case
@@ -89,6 +89,20 @@ def test_regret_by_hand(tmp_path: Path) -> None:
     assert found["worst_state"] == pytest.approx(worst)
     assert found["bounds"] is None
     assert found["bounds_missing"] == "no window was lived as scheduled, from its begin into the next one"
+
+
+def test_a_units_regret_is_the_mean_over_the_ticks_of_all_environments(tmp_path: Path) -> None:
+    """Unit 0: (3 * 1/2 + 1 + 1) / 5 = 7/10. Unit 1 as above, 4 ticks of the same policy."""
+    of_another: list[Entry] = [
+        ActedIn(incarnation=1, next_seq=9, unit=unit, ticks=ticks, env="env1")
+        for unit, ticks in ((0, {1: 1}), (1, {2: 2}))
+    ]
+    fleet = replace(CHAIN, env=replace(CHAIN.env, count=2))
+    found = run_with(tmp_path, [*LIVED, *of_another], fleet)["regret"]
+    assert (found["units"], found["ticks"], found["left_out_ticks"]) == (3, 13, 16)
+    assert {name: found[name] for name in ("total", "update", "hold")} == pytest.approx(
+        {"total": 1.2, "update": 0.7, "hold": 0.5}
+    )
 
 
 def test_a_version_with_two_tables_is_left_out(tmp_path: Path) -> None:

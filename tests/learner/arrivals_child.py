@@ -123,17 +123,17 @@ def live(run: RunDir, arrivals: Arrivals, life: Life | None) -> None:
     begin = files.seen
     now_ns = arrivals.batches[max(0, begin - 1)][0] + (begin > 0) * 30_000_000  # the outage takes some time
     clock, hub = VirtualClock(now_ns), MemoryHub()
-    logs: dict[int, Publisher[StepBatch]] = {}
+    logs: dict[tuple[str, int], Publisher[StepBatch]] = {}
 
     def send(batch: StepBatch) -> None:
-        """By a publisher of each incarnation, whose cache can be reached for ever."""
-        incarnation = batch.steps[0].incarnation
-        if incarnation not in logs:
+        """By a publisher of each life of an env server, whose cache can be reached for ever."""
+        name, incarnation = life = batch.steps[0].env, batch.steps[0].incarnation
+        if life not in logs:
             env = hub.bus(channels.ENV_SERVER, clock)
-            spec = msgspec.structs.replace(arrivals.spec, incarnation=incarnation)
-            env.publisher(channels.SPEC, "env0").put(spec)
-            logs[incarnation] = env.publisher(channels.LOG, "env0")
-        logs[incarnation].put(batch)
+            spec = msgspec.structs.replace(arrivals.spec, env=name, incarnation=incarnation)
+            env.publisher(channels.SPEC, name).put(spec)
+            logs[life] = env.publisher(channels.LOG, name)
+        logs[life].put(batch)
 
     for _, batch in arrivals.batches[:begin]:
         send(batch)

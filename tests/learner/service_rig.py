@@ -60,7 +60,7 @@ class Rig:
         levers: Levers | None = None,
         clock: VirtualClock | None = None,
     ) -> None:
-        hub = MemoryHub()
+        hub = self.hub = MemoryHub()
         self.clock = clock or VirtualClock(0)
         life = run_dir.next_incarnation(channels.LEARNER, 1)
         self.ledger = Ledger(channels.LEARNER, life, Tally.create(run_dir.tally_path(channels.LEARNER, life)))

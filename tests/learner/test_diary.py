@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import resource
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
 import pytest
 
 from learner import diary
-from learner.diary import FALLBACK, Acted, Diary, Entered, Forecast, Published, Tally
+from learner.diary import FALLBACK, Acted, ActedIn, Diary, Entered, Forecast, Published, Tally
 from rtcore.clock import VirtualClock
 from rtcore.ledger import Ledger
 from rtcore.messages import Architecture, Policy, Spec, Step, WindowNotice
@@ -50,11 +52,18 @@ class Student:
 class Writer:
     """A diary in a directory, with its ledger."""
 
-    def __init__(self, directory: Path, spec: Spec = FINITE) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        spec: Spec = FINITE,
+        *,
+        envs: Sequence[str] = ("env0",),
+        pending: Mapping[str, Acted] = MappingProxyType({}),
+    ) -> None:
         self.path = directory / diary.NAME
         self.ledger = Ledger("learner", 1)
         self.diary = Diary(self.path, VirtualClock(0), self.ledger)
-        self.diary.meet(spec)
+        self.diary.meet(spec, envs, pending)
 
     def acted(self) -> list[Acted]:
         return [one for one in diary.read(self.path).entries if isinstance(one, Acted)]
@@ -118,6 +127,37 @@ def test_a_step_is_counted_once_whatever_an_earlier_learner_told(tmp_path: Path)
     assert [(one.incarnation, one.unit, one.ticks) for one in later.acted()] == [
         (7, 0, {0: 9}), (7, 1, {0: 10}), (8, 0, {0: 4}),
     ]  # fmt: skip
+
+
+def test_a_fleet_tells_of_each_environment(tmp_path: Path) -> None:
+    """Killed in unit 1 of both, with what it had not told in its replay's note; the next goes on by that."""
+    envs = ["env0", "env1"]
+
+    def both(first: int, last: int) -> list[Step]:
+        return [
+            msgspec.structs.replace(lived(seq, version), env=env)
+            for seq in range(first, last)
+            for version, env in enumerate(envs)
+        ]
+
+    writers = [Writer(tmp_path, envs=envs)]
+    writers[0].diary.acted(both(0, 15))
+    pending = writers[0].diary.pending
+    assert pending == {
+        env: Acted(incarnation=7, next_seq=15, unit=1, ticks={version: 5}) for version, env in enumerate(envs)
+    }
+    writers.append(Writer(tmp_path, envs=envs, pending=pending))
+    writers[1].diary.acted(both(12, 20))
+    writers[1].diary.finish()
+    assert writers[1].acted() == [
+        ActedIn(incarnation=7, next_seq=10 * unit + 10, unit=unit, ticks={version: 9 + unit}, env=env)
+        for unit in range(2)
+        for version, env in enumerate(envs)
+    ]
+    writers.append(Writer(tmp_path, envs=envs))  # without a note: by what is written
+    writers[2].diary.acted(both(15, 21))
+    writers[2].diary.finish()
+    assert [(one.unit, one.ticks) for one in writers[2].acted()[4:]] == [(2, {0: 1}), (2, {1: 1})]
 
 
 @pytest.mark.parametrize("kept", [1, 3, 5, -1])

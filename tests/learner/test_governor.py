@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import pytest
 
 from learner.governor import Decision, Governor, Power, ladder
@@ -14,36 +17,45 @@ MS = 1_000_000
 class Log:
     """Makes ticks one after the other and feeds each to the governor as it happens."""
 
-    def __init__(self, threads: int = 1) -> None:
-        self.governor = Governor(threads, TICK_NS)
+    def __init__(self, threads: int = 1, envs: Sequence[str] = ("env0",)) -> None:
+        self.governor = Governor(threads, TICK_NS, envs)
         self.seq = 0
         self.delay_ns = 0  # from a tick to the learner's hearing of it
 
-    def tick(
+    def tick(self, *, busy: bool = True, **fields: Any) -> Decision | None:
+        """One more tick, as `step` has it; `busy`: the learner worked meanwhile."""
+        due_ns = self.work(busy=busy)
+        return self.governor.feed([self.step("env0", **fields)], due_ns + self.delay_ns)
+
+    def work(self, *, busy: bool = True) -> int:
+        """A period passes; returns its end."""
+        self.seq += 1
+        due_ns = self.seq * TICK_NS
+        if busy:
+            self.governor.worked(due_ns - TICK_NS, due_ns)
+        return due_ns
+
+    def step(
         self,
+        env: str,
         *,
         sent_ms: float = 1.0,
         loop_ms: float = 2.0,
         cause: MissCause = "",
         skipped: int = 0,
-        busy: bool = True,
         reset: bool = False,
         incarnation: int = 7,
-    ) -> Decision | None:
-        """One more tick; `sent_ms` after its deadline its step left, `busy`: the learner worked meanwhile."""
-        self.seq += 1
+    ) -> Step:
+        """What the log says of the newest period; the step left `sent_ms` after its deadline."""
         due_ns = self.seq * TICK_NS
-        if busy:
-            self.governor.worked(due_ns - TICK_NS, due_ns)
-        step = Step(
-            env="env0", incarnation=incarnation, seq=self.seq, tick=self.seq, episode=0,
+        return Step(
+            env=env, incarnation=incarnation, seq=self.seq, tick=self.seq, episode=0,
             episode_tick=0 if reset else self.seq, unit=0, due_ns=due_ns, woke_ns=due_ns,
             sent_ns=due_ns + round(sent_ms * MS), observation=b"", reward=0.0, terminated=False,
             truncated=False, action=b"", decision=b"", answered_tick=self.seq - 1, policy_version=0,
             missed=cause != "", fallback="", cause=cause, skipped=skipped,
             loop_ns=-1 if cause else round(loop_ms * MS), reaction_ns=-1, drift=0.0, position=b"",
         )  # fmt: skip
-        return self.governor.feed([step], due_ns + self.delay_ns)
 
     def quiet(self, ticks: int, *, busy: bool = True) -> list[tuple[int, Power]]:
         """Untroubled ticks: which of them, from 1, brought a decision, and to what."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from learner import checkpoint, diary
-from learner.diary import Acted, Published
+from learner.diary import Acted, ActedIn, Published
 from learner.replay import Replay, open_replay
 from rtcore import channels
 from rtcore.config import RunConfig
@@ -33,19 +34,23 @@ from tests.learner.tabular.test_table_service import (
 STEPS, BATCH, KILLS = 1200, 3, 20
 RESTART = 700  # the tick at which the env server comes back
 RUN = replace(CONFIG, learner=replace(CONFIG.learner, replay_capacity=500, checkpoint_s=5.0))
+EACH = 300
+# Three environments with so many ticks each, and room for all of their transitions: in which order
+# those of several come is nobody's to say, and so neither is which are the oldest.
+FLEET = replace(RUN, env=replace(RUN.env, count=3), learner=replace(RUN.learner, replay_capacity=STEPS))
 
 
-def step(tick: int) -> Step:
+def step(tick: int, env: int = 0, restart: int = RESTART) -> Step:
     """Episodes of 50 ticks."""
-    incarnation, begin = (7, 0) if tick < RESTART else (8, RESTART)
+    incarnation, begin = (7, 0) if tick < restart else (8, restart)
     episode_tick = (tick - begin) % 50
     reset = episode_tick == 0
     decision = b"" if reset else np.array([action_at(tick)], np.float32).tobytes()
     return Step(
-        env="env0", incarnation=incarnation, seq=tick - begin, tick=tick, episode=(tick - begin) // 50,
+        env=f"env{env}", incarnation=incarnation, seq=tick - begin, tick=tick, episode=(tick - begin) // 50,
         episode_tick=episode_tick, unit=tick // TICKS, due_ns=tick * TICK_NS, woke_ns=tick * TICK_NS,
         sent_ns=tick * TICK_NS, observation=np.array([state_at(tick)], np.float32).tobytes(),
-        reward=0.0 if reset else reward_at(tick) + tick / 1000,
+        reward=0.0 if reset else reward_at(tick) + tick / 1000 + 100 * env,
         terminated=False, truncated=episode_tick == 49,
         action=decision, decision=decision, answered_tick=tick - 1, policy_version=tick // 100, missed=False,
         fallback="", cause="", skipped=0, loop_ns=0, reaction_ns=-1, drift=0.0, position=b"",
@@ -70,6 +75,25 @@ def arrivals(path: Path) -> Path:
     return path
 
 
+def fleet_arrivals(path: Path) -> Path:
+    """In batches of 3 ticks, of the three environments in turn, the second of which comes back. Of each 10
+    one changes places with the next of its environment, another one comes twice, and one in 70 never."""
+    batches: list[tuple[int, StepBatch]] = []
+    for first in range(0, EACH, BATCH):
+        for env in range(3):
+            restart = 201 if env == 1 else STEPS
+            steps = [step(tick, env, restart) for tick in range(first, min(first + BATCH, EACH))]
+            batches.append((first * TICK_NS + env, StepBatch(steps=steps)))
+    for index in range(4, len(batches) - 3, 10):
+        (early, one), (late, other) = batches[index], batches[index + 3]  # of the same environment
+        batches[index], batches[index + 3] = (early, other), (late, one)
+    del batches[50::70]
+    for index in range(9, len(batches), 10):
+        batches.insert(index, batches[index - 1])
+    path.write_bytes(msgspec.msgpack.encode(Arrivals(SPEC, batches)))
+    return path
+
+
 def random_lives(seed: int, arrived: int) -> list[Life]:
     """`KILLS` of them: at any line of the learner's code, within a mark, at any instant."""
     rng = np.random.default_rng(seed)
@@ -86,7 +110,7 @@ class Outcome:
     """What a run left behind."""
 
     def __init__(self, path: Path, recorded: Path, lives: list[Life], config: RunConfig = RUN) -> None:
-        self.run = RunDir.create(path, config)
+        self.run, self.config = RunDir.create(path, config), config
         plan = msgspec.json.encode(lives).decode()
         command = [sys.executable, "-m", "tests.learner.arrivals_child", str(path), str(recorded), plan]
         root = Path(__file__).parents[2]
@@ -96,7 +120,17 @@ class Outcome:
 
     @property
     def replay(self) -> Replay:
-        return open_replay(self.run.learner_dir / "replay", RUN.learner.replay_capacity, 1, 1)
+        capacity, envs = self.config.learner.replay_capacity, self.config.env.count
+        return open_replay(self.run.learner_dir / "replay", capacity, 1, 1, envs=envs)
+
+    @property
+    def rows(self) -> list[list[tuple[float, ...]]]:
+        """Of each environment, in order: reward, observations, action."""
+        rows, found = self.replay.read(0, STEPS), [[], [], []]  # type: ignore[var-annotated]
+        for index, reward in enumerate(rows.reward.tolist()):
+            ends = float(rows.observation[index, 0]), float(rows.next_observation[index, 0])
+            found[int(reward // 100)].append((reward, *ends, float(rows.action[index, 0])))
+        return found
 
     @property
     def q(self) -> list[list[float]]:
@@ -118,13 +152,14 @@ class Outcome:
         return diary.read(self.run.learner_dir / diary.NAME).entries
 
     @property
-    def acted(self) -> dict[tuple[int, int], int]:
-        """Ticks by unit and version."""
-        found: dict[tuple[int, int], int] = {}
+    def acted(self) -> Counter[tuple[str, int, int]]:
+        """Ticks by environment, unit and version."""
+        found: Counter[tuple[str, int, int]] = Counter()
         for entry in self.diary:
             if isinstance(entry, Acted):
+                env = entry.env if isinstance(entry, ActedIn) else ""
                 for version, ticks in entry.ticks.items():
-                    found[entry.unit, version] = found.get((entry.unit, version), 0) + ticks
+                    found[env, entry.unit, version] += ticks
         return found
 
 
@@ -143,9 +178,9 @@ def killed(tmp_path_factory: pytest.TempPathFactory, recorded: Path) -> Outcome:
     return killed_at_random(tmp_path_factory.mktemp("killed") / "run", recorded, seed=1)
 
 
-def killed_at_random(path: Path, recorded: Path, seed: int) -> Outcome:
+def killed_at_random(path: Path, recorded: Path, seed: int, config: RunConfig = RUN) -> Outcome:
     batches = msgspec.msgpack.decode(recorded.read_bytes(), type=Arrivals).batches
-    return Outcome(path, recorded, random_lives(seed, len(batches)))
+    return Outcome(path, recorded, random_lives(seed, len(batches)), config)
 
 
 def test_killed_20_times_it_ends_with_the_same(killed: Outcome, straight: Outcome) -> None:
@@ -167,3 +202,19 @@ def test_killed_20_times_no_version_and_no_iterate_comes_twice(killed: Outcome, 
     assert {one[:3] for one in fresh} <= told
     assert killed.counted("published_in_hold") == 0
     assert len(fresh) >= len(straight.published) - KILLS
+
+
+def test_killed_20_times_it_has_learned_the_same_from_each_environment_of_a_fleet(tmp_path: Path) -> None:
+    """It takes what comes as it comes, so only the transitions of each one have an order."""
+    recorded = fleet_arrivals(tmp_path / "arrivals.msgpack")
+    straight = Outcome(tmp_path / "straight", recorded, [], FLEET)
+    killed = killed_at_random(tmp_path / "killed", recorded, 1, FLEET)
+    assert killed.rows == straight.rows
+    assert killed.acted == straight.acted
+    envs = ("env0", "env1", "env2")
+    for name in ("learned", "gaps", "broken"):
+        for env in envs:
+            assert killed.counted(f"{name}.{env}") == straight.counted(f"{name}.{env}"), (name, env)
+            assert name == "broken" or straight.counted(f"{name}.{env}") > 0
+        assert killed.counted(name) == sum(killed.counted(f"{name}.{env}") for env in envs)
+    assert [killed.counted(f"learned.{env}") for env in envs] == [len(rows) for rows in killed.rows]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from learner import checkpoint, meeting, outbox
-from learner.intake import Intake
+from learner.intakes import Intakes
 from learner.replay import Replay, open_replay
 from rtcore.config import ConfigError, LearnerConfig, RunConfig
 from rtcore.run_dir import RunDir
@@ -81,7 +81,7 @@ def test_what_was_committed_and_not_counted_is_counted_by_the_next(
     first = start(run_dir)
     first.live(0, 10)
     with monkeypatch.context() as patch:
-        patch.setattr(Intake, "_account", killed)
+        patch.setattr(Intakes, "_account", killed)
         with pytest.raises(Killed):
             first.live(11, 11)
     assert (held(run_dir).added, counted(run_dir, "learned"), counted(run_dir, "received")) == (11, 10, 11)
