@@ -162,6 +162,10 @@ class Codec(Generic[MessageT]):
             return None
         return message
 
+    def reject(self, reason: object) -> None:
+        """Count a message that was not looked at."""
+        self._rejections.count(self._channel.name, reason)
+
     @staticmethod
     def _compare(said: str | None, name: str) -> None:
         if said is not None and said != name:

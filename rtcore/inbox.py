@@ -121,10 +121,13 @@ class QueueInbox(Generic[MessageT]):
         return self._dropped
 
     def offer(self, payload: bytes, received_ns: int, name: str = "") -> None:
-        """Append; a full queue loses its oldest."""
+        """Append; a full queue loses its oldest, which counts as refused."""
         with self._lock:
-            self._dropped += len(self._items) == self._items.maxlen
+            full = len(self._items) == self._items.maxlen
+            self._dropped += full
             self._items.append((payload, received_ns, name))
+        if full:
+            self._codec.reject("the queue is full: the oldest is lost")
         self._bell.ring()
 
     def drain(self) -> list[Received[MessageT]]:

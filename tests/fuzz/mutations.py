@@ -48,6 +48,16 @@ def flipped(rng: random.Random, data: bytes) -> bytes:
     return bytes(changed)
 
 
+def mutate_command(rng: random.Random, true: Sequence[bytes]) -> bytes:
+    """A command with something wrong about it, most often; `true` are right ones."""
+    payload = rng.choice(true)
+    if rng.random() < 0.3:
+        return flipped(rng, payload)
+    if rng.random() < 0.1:
+        return bytes(70_000)
+    return msgspec.msgpack.encode(replace_one(rng, msgspec.msgpack.decode(payload)))
+
+
 class Mutator:
     """Makes one bad payload after the other. `heard` are true payloads, at least one, sealed."""
 

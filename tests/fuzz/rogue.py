@@ -86,6 +86,7 @@ class RogueRun:
         self.run_dir = RunDir.create(path, config)
         self.config = config
         self.simulation = Simulation(config, self.run_dir, stack)
+        self.env, self.agent = self.simulation.pairs[0]
         self.hub: MemoryHub = self.simulation._hub
         self.client = self.hub.bus(CLIENT, self.simulation._clock)
         stack.callback(self.client.close)
@@ -103,23 +104,23 @@ class RogueRun:
     def run(self, speak: Callable[[int], None]) -> Outcome:
         """The whole run; `speak` is called in each tick, between the agent's answer and the deadline."""
         sim = self.simulation
-        sim.env.announce()
-        sim.agent.attend()
-        for tick in sim.env.pacer.ticks(Stop()):
+        self.env.announce()
+        self.agent.attend()
+        for tick in self.env.pacer.ticks(Stop()):
             speak(tick.index)
-            sim.agent.poll_policies()
-            sim.env.step(tick)
-            sim.agent.check()
-            flushed = sim.env.journal.flush_due(sim._clock.now_ns())
+            self.agent.poll_policies()
+            self.env.step(tick)
+            self.agent.check()
+            flushed = self.env.journal.flush_due(sim._clock.now_ns())
             sim.learner.catch_up()
             if flushed:
                 sim._record()
                 self._look()
-        sim.env.close()
+        self.env.close()
         sim.learner.catch_up()
         sim.learner.close()
-        sim.agent.poll_policies()
-        sim.agent.close()
+        self.agent.poll_policies()
+        self.agent.close()
         final = {name: stats[0] for name, stats in sim.finish().items()}
         self._look()
         return Outcome(self.policies, self.log, final, self.watch)
@@ -156,8 +157,8 @@ class RogueRun:
         sim = self.simulation
         handlers = {
             "learner": sim.learner.command,
-            "agent_service": sim.agent.command,
-            "env_server": lambda command: sim.env.command(command, Stop()),
+            "agent_service": self.agent.command,
+            "env_server": lambda command: self.env.command(command, Stop()),
         }
         sim._buses[name].serve(name, handlers[name])
 
