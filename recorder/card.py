@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from recorder.student import student_rows
+from rtcore.cast import env_names
 from rtcore.config import DriftConfig, DriftKind, EnvConfig, RunConfig
 from rtcore.messages import Spec
 
@@ -13,6 +14,7 @@ def run_card(run: str, config: RunConfig, spec: Spec, placements: Mapping[str, s
     """Markdown. `placements` says per process what the system granted it."""
     world = [
         ("environment", f"`{spec.env_id}` ({_spaces(spec)})"),
+        *_fleet(config.env),
         ("rate", _rate(spec)),
         ("episode", f"{config.env.episode_steps} ticks"),
         ("unit t", f"{spec.unit_ns / 1e9:g} s"),
@@ -33,6 +35,13 @@ def run_card(run: str, config: RunConfig, spec: Spec, placements: Mapping[str, s
     if placements:
         page += ["## Placement", _table(sorted(placements.items()))]
     return "\n\n".join(page) + "\n"
+
+
+def _fleet(env: EnvConfig) -> list[tuple[str, str]]:
+    names = env_names(env)
+    if len(names) == 1:
+        return []
+    return [("fleet", f"{len(names)} of it, {names[0]} to {names[-1]}, with an agent each")]
 
 
 def _spaces(spec: Spec) -> str:

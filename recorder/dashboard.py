@@ -32,14 +32,19 @@ def dashboard(
         drift_is_speed: whether `/env/drift` is a target speed.
         live: follow the end of a running stream instead of showing everything.
     """
-    plots = _Plots(live)
+    plots = Plots(live)
     columns: list[Any] = [
         _left(spec, camera),
         rrb.Vertical(*_middle(plots, drift_is_speed=drift_is_speed), row_shares=[0.8, 2, 2, 2]),
         rrb.Vertical(*_right(plots, spec), row_shares=[2, 0.8, 2, 2]),
     ]
+    return page(rrb.Horizontal(*columns, column_shares=[1, 1, 1]))
+
+
+def page(layout: Any) -> rrb.Blueprint:
+    """A layout with the panels around it out of the way."""
     return rrb.Blueprint(
-        rrb.Horizontal(*columns, column_shares=[1, 1, 1]),
+        layout,
         rrb.TimePanel(state="collapsed", timeline="run_time", play_state="following"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
@@ -48,30 +53,44 @@ def dashboard(
     )
 
 
-def _left(spec: Spec, camera: Camera | None) -> Any:
-    card = rrb.TextDocumentView(origin="/run_card", name="Run card")
-    log = rrb.TextLogView(
+def log_view() -> Any:
+    """What was said."""
+    return rrb.TextLogView(
         origin="/log",
         name="Log of all processes",
         rows=rrb.TextLogRows(filter_by_log_level=SHOWN_LEVELS),
         columns=rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["LogLevel", "Body"]),
     )
-    if camera is None:
-        return rrb.Vertical(card, log, row_shares=[1, 1])
-    world = rrb.Spatial3DView(
-        origin=FOLLOW,
-        contents=f"{ROOT}/**",
-        name=f"World: {spec.env_id}",
+
+
+def run_card_view() -> Any:
+    """What this is of."""
+    return rrb.TextDocumentView(origin="/run_card", name="Run card")
+
+
+def world_view(name: str, camera: Camera, root: str = "") -> Any:
+    """The world in 3-D, of the environment whose entities lie below `root`."""
+    return rrb.Spatial3DView(
+        origin=root + FOLLOW,
+        contents=f"{root}{ROOT}/**",
+        name=name,
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=camera.eye, look_target=camera.target
         ),
     )
+
+
+def _left(spec: Spec, camera: Camera | None) -> Any:
+    card, log = run_card_view(), log_view()
+    if camera is None:
+        return rrb.Vertical(card, log, row_shares=[1, 1])
+    world = world_view(f"World: {spec.env_id}", camera)
     return rrb.Vertical(world, rrb.Tabs(log, card), row_shares=[3, 2])
 
 
-def _middle(plots: _Plots, *, drift_is_speed: bool) -> list[Any]:
+def _middle(plots: Plots, *, drift_is_speed: bool) -> list[Any]:
     return [
         plots.states("Learner's phase", "/learner/phase"),
         plots.lines("Drifting target and speed reached, m/s", "/env/drift", legend=True)
@@ -82,25 +101,30 @@ def _middle(plots: _Plots, *, drift_is_speed: bool) -> list[Any]:
     ]
 
 
-def _right(plots: _Plots, spec: Spec) -> list[Any]:
+def _right(plots: Plots, spec: Spec) -> list[Any]:
     latency = f"Latency, µs (deadline {spec.tick_ns / 1e3:,.0f})"
     return [
         plots.lines(latency, "/agent/loop_us", "/agent/reaction_us", "/env/pacing_us", legend=True),
         plots.lines("Missed deadlines", MISSED, *(f"{MISSED}/{cause}" for cause in CAUSES), legend=True),
         plots.lines("Policy version", "/learner/published_version", "/agent/policy_version", legend=True),
-        rrb.Tabs(
-            plots.lines("Losses", "/learner/loss/**", legend=True),
-            plots.lines("Forecast", FORECAST, legend=True),
-            plots.lines("Window, units", "/learner/schedule/update", "/learner/schedule/hold", legend=True),
-            plots.lines("Mean Q", "/learner/q_mean"),
-            *([] if spec.states else [plots.lines("Temperature", "/learner/alpha")]),  # tables have none
-            plots.lines("Entropy", "/learner/entropy"),
-            plots.lines("Updates per s", "/learner/updates_per_s"),
-        ),
+        rrb.Tabs(*learner_plots(plots, spec)),
     ]
 
 
-class _Plots:
+def learner_plots(plots: Plots, spec: Spec) -> list[Any]:
+    """What the learner says of itself; one of them is looked at at a time."""
+    return [
+        plots.lines("Losses", "/learner/loss/**", legend=True),
+        plots.lines("Forecast", FORECAST, legend=True),
+        plots.lines("Window, units", "/learner/schedule/update", "/learner/schedule/hold", legend=True),
+        plots.lines("Mean Q", "/learner/q_mean"),
+        *([] if spec.states else [plots.lines("Temperature", "/learner/alpha")]),  # tables have none
+        plots.lines("Entropy", "/learner/entropy"),
+        plots.lines("Updates per s", "/learner/updates_per_s"),
+    ]
+
+
+class Plots:
     """Makes views over run time: of the whole run, or of its last half minute.
 
     Their axes are not linked: a linked axis shows the half minute around the cursor, whatever range it is

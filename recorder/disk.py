@@ -8,42 +8,38 @@ from __future__ import annotations
 
 import errno
 import os
-import struct
 from contextlib import suppress
 from pathlib import Path
 
 from recorder.finish import MAGIC, set_aside
+from recorder.frames import END, MESSAGE_HEAD, STREAM_HEAD
 from recorder.place import Kept, Place, PlaceFile
 from rtcore.clock import Clock
 
 RETRY_NS = 5_000_000_000
-_STREAM_HEAD = 12  # bytes: magic, version, options
-_MESSAGE_HEAD = struct.Struct("<QQ")  # kind, length of what follows
-_END = 0
 
 
 def unframed(rrd: bytes) -> tuple[bytes, bytes]:
     """The head, and the messages without the end, of a whole recording as Rerun (0.41) encodes one.
 
-    Messages of several, one after the other behind the head of the first, are a recording without an end, as
-    a process that was killed leaves it: `finish` adds it.
+    See `recorder.frames` for what becomes of messages without an end.
 
     Raises:
         ValueError: this is no recording, or torn.
     """
     if rrd[: len(MAGIC)] != MAGIC:
         raise ValueError(f"no recording begins with {rrd[: len(MAGIC)]!r}")
-    at = _STREAM_HEAD
+    at = STREAM_HEAD
     while at < len(rrd):
-        if at + _MESSAGE_HEAD.size > len(rrd):
+        if at + MESSAGE_HEAD.size > len(rrd):
             raise ValueError("a recording is torn")
-        kind, length = _MESSAGE_HEAD.unpack_from(rrd, at)
-        if kind == _END:
+        kind, length = MESSAGE_HEAD.unpack_from(rrd, at)
+        if kind == END:
             break
-        at += _MESSAGE_HEAD.size + length
+        at += MESSAGE_HEAD.size + length
     if at > len(rrd):
         raise ValueError("a recording is torn")
-    return rrd[:_STREAM_HEAD], rrd[_STREAM_HEAD:at]
+    return rrd[:STREAM_HEAD], rrd[STREAM_HEAD:at]
 
 
 class RecordingFile:
@@ -56,10 +52,10 @@ class RecordingFile:
         part: where that which earlier lives wrote lies until the end; None: there was none.
     """
 
-    def __init__(self, path: Path, place_path: Path, clock: Clock) -> None:
+    def __init__(self, path: Path, place_path: Path, clock: Clock, num_envs: int = 1) -> None:
         self._path = path
         self._clock = clock
-        self._place_file = PlaceFile(place_path)
+        self._place_file = PlaceFile(place_path, num_envs)
         self._earlier: Kept | None = None
         self._file: int | None = None
         self._length = 0

@@ -1,28 +1,39 @@
-"""What the recorder hears: the env server's log, everybody's stats, the learner's phases and policies."""
+"""What the recorder hears: the env servers' logs, everybody's stats, the learner's phases and policies."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from recorder.place import Place
 from recorder.telemetry import TelemetryRows
 from rtcore import channels
 from rtcore.bus import Bus
+from rtcore.cast import role_of
 from rtcore.log_reader import LogReader
 from rtcore.messages import Spec, Stats, Step
 
-LOG_CAPACITY = 2_000  # batches: 100 s of a recorder that hangs, 50 MB at 1 kHz
+LOG_CAPACITY = 2_000  # batches of all logs: 100 s of a recorder that hangs, 50 MB at 1 kHz ...
+LEAST_CAPACITY = 400  # ... but of each log 20 s of it
 STATS_CAPACITY = 2_000
 POLICY_CAPACITY = 64  # a few hundred kB each
 WINDOW_CAPACITY = 2_000
 # Whose last words are waited for. The launcher's come after the recorder's end.
-WAITED_FOR = tuple(name for name in channels.PROCESSES if name != channels.RECORDER)
+WAITED_FOR = tuple(role for role in channels.PROCESSES if role != channels.RECORDER)
 
 
 class Intake:
-    """Drains the bus into steps and telemetry, and counts what got lost on the way."""
+    """Drains the bus into steps and telemetry, and counts what got lost on the way.
 
-    def __init__(self, bus: Bus, env: str, telemetry: TelemetryRows) -> None:
-        self._specs = bus.latest(channels.SPEC, env)
-        self._log = LogReader(bus, env, capacity_batches=LOG_CAPACITY)
+    Args:
+        bus: to hear.
+        envs: names of the environments.
+        telemetry: takes all that is no step.
+    """
+
+    def __init__(self, bus: Bus, envs: Sequence[str], telemetry: TelemetryRows) -> None:
+        capacity = LOG_CAPACITY if len(envs) == 1 else max(LEAST_CAPACITY, LOG_CAPACITY // len(envs))
+        self._specs = {env: bus.latest(channels.SPEC, env) for env in envs}
+        self._logs = {env: LogReader(bus, env, capacity_batches=capacity) for env in envs}
         self._stats = bus.queue(channels.STATS, "*", capacity=STATS_CAPACITY)
         self._notices = bus.queue(channels.WINDOW, capacity=WINDOW_CAPACITY)
         self._policies = bus.queue(channels.POLICY, capacity=POLICY_CAPACITY)
@@ -32,46 +43,50 @@ class Intake:
 
     def go_on_from(self, place: Place) -> None:
         """Begin where an earlier life of the recorder ended. Call it before anything is taken."""
-        self._log.go_on_from(place.log)
+        for env, own in place.envs.items():
+            if env in self._logs:
+                self._logs[env].go_on_from(own.log)
         self.placements = dict(place.placements)
 
     @property
-    def position(self) -> tuple[int, int] | None:
-        """(incarnation, seq) of the step that is due next; None before the first step."""
-        return self._log.stream.position
+    def positions(self) -> dict[str, tuple[int, int] | None]:
+        """By environment, (incarnation, seq) of the step that is due next; None before the first step."""
+        return {env: log.stream.position for env, log in self._logs.items()}
 
     @property
-    def gaps(self) -> int:
-        """Steps that never came. A batch lost to a full queue shows here, by its steps."""
-        return self._log.stream.gaps
+    def gaps(self) -> dict[str, int]:
+        """By environment, steps that never came. A batch lost to a full queue shows here, by its steps."""
+        return {env: log.stream.gaps for env, log in self._logs.items()}
 
     @property
     def dropped(self) -> int:
         """Steps that never came, and other messages lost to a full queue."""
         others = self._stats.dropped + self._notices.dropped + self._policies.dropped
-        return self.gaps + others
+        return sum(self.gaps.values()) + others
 
     @property
     def complete(self) -> bool:
-        """The env server has ended in order, and everybody heard has sent final stats."""
-        return self._log.ended and not self._speaking
+        """All env servers have ended in order, and everybody heard has sent final stats."""
+        return all(log.ended for log in self._logs.values()) and not self._speaking
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for steps, at most so long."""
-        self._log.wait(timeout_s)
+        """Wait for steps of an env server that has not ended, at most so long."""
+        logs = list(self._logs.values())
+        next((log for log in logs if not log.ended), logs[0]).wait(timeout_s)
 
-    def take_spec(self) -> Spec | None:
-        """The env server's declaration, if it is new."""
-        received = self._specs.take()
-        return received.message if received is not None else None
+    def take_specs(self) -> dict[str, Spec]:
+        """The env servers' declarations that are new, by environment."""
+        received = {env: reader.take() for env, reader in self._specs.items()}
+        return {env: spec.message for env, spec in received.items() if spec is not None}
 
-    def take_steps(self, now_ns: int) -> list[Step]:
-        """New steps in order, each once; those behind a missing one come when it does, or 5 s later."""
-        return self._log.read(now_ns)
+    def take_steps(self, now_ns: int) -> dict[str, list[Step]]:
+        """By environment, new steps in order, each once; those behind a missing one come when it does, or 5 s
+        later."""
+        return {env: log.read(now_ns) for env, log in self._logs.items()}
 
-    def give_up_on_gaps(self) -> list[Step]:
+    def give_up_on_gaps(self) -> dict[str, list[Step]]:
         """The steps that still waited for earlier ones; those now count as lost."""
-        return self._log.finish()
+        return {env: log.finish() for env, log in self._logs.items()}
 
     def take_telemetry(self) -> int:
         """Pass on stats, phases and policies; returns how many messages there were."""
@@ -88,7 +103,7 @@ class Intake:
         self._telemetry.stats(stats)
         if stats.final:
             self._speaking.discard(stats.process)
-        elif stats.process in WAITED_FOR:
+        elif role_of(stats.process) in WAITED_FOR:
             self._speaking.add(stats.process)
         prefix = f"{stats.process}: "  # every process's first event: its scheduling and cores
         for event in stats.events:

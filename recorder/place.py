@@ -22,7 +22,8 @@ import msgspec
 
 from recorder.seen import SeenMark
 
-SLOT_BYTES = 32_768  # five processes with 256 events each, and 256 window notices, are 25 kB
+SLOT_BYTES = 32_768  # five processes with 256 events each, and 256 window notices, are 25 kB ...
+ENV_BYTES = 12_288  # ... and two more, with what else a further environment brings, 10 kB
 _HEAD = struct.Struct("<QII")
 
 
@@ -45,19 +46,32 @@ class Told(msgspec.Struct, frozen=True, array_like=True):
     forecast_names: list[str] = []
 
 
-class Place(msgspec.Struct, frozen=True, array_like=True):
-    """How far a recording has got.
+class EnvPlace(msgspec.Struct, frozen=True, array_like=True):
+    """How far a recording has got with one environment.
 
     Attributes:
         log: (incarnation, seq) of the next step of the env server's log; None: none came yet.
         carried: from the last step; None: there is none.
         episodes: (number, run time in ns of its first step) of the newest ones.
-        placements: process -> what the system granted it.
     """
 
     log: tuple[int, int] | None = None
     carried: Carried | None = None
     episodes: list[tuple[int, int]] = []
+
+
+START = EnvPlace()
+
+
+class Place(msgspec.Struct, frozen=True, array_like=True):
+    """How far a recording has got, with all environments at the same length of the file.
+
+    Attributes:
+        envs: by the environment's name; those that nothing is written of yet may be missing.
+        placements: process -> what the system granted it.
+    """
+
+    envs: dict[str, EnvPlace] = {}
     placements: dict[str, str] = {}
     told: Told = Told()
 
@@ -71,10 +85,11 @@ class Kept(msgspec.Struct, frozen=True, array_like=True):
 
 
 class PlaceFile:
-    """The file of the place. Constructing one touches nothing."""
+    """The file of the place, of a run with so many environments. Constructing one touches nothing."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, num_envs: int = 1) -> None:
         self._path = path
+        self._slot_bytes = SLOT_BYTES + (num_envs - 1) * ENV_BYTES
         self._file: int | None = None
         self._generation = 0
 
@@ -84,7 +99,7 @@ class PlaceFile:
             data = self._path.read_bytes()
         except OSError:
             return None
-        found = dict(_whole(data))
+        found = dict(_whole(data, self._slot_bytes))
         if not found:
             return None
         self._generation = max(found)
@@ -97,13 +112,13 @@ class PlaceFile:
             OSError: it is not written; the last one is as it was.
         """
         payload = msgspec.msgpack.encode(kept)
-        if len(payload) > SLOT_BYTES - _HEAD.size:
+        if len(payload) > self._slot_bytes - _HEAD.size:
             raise OSError(errno.EFBIG, f"{len(payload)} bytes are too many for a place")
         if self._file is None:
             self._file = self._opened()
         generation = self._generation + 1
         head = _HEAD.pack(generation, len(payload), _check(generation, payload))
-        offset = generation % 2 * SLOT_BYTES
+        offset = generation % 2 * self._slot_bytes
         if os.pwrite(self._file, head + payload, offset) < len(head) + len(payload):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._generation = generation
@@ -117,7 +132,7 @@ class PlaceFile:
     def _opened(self) -> int:
         file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
-            os.posix_fallocate(file, 0, 2 * SLOT_BYTES)  # a disk that gets full later has room for it
+            os.posix_fallocate(file, 0, 2 * self._slot_bytes)  # a disk that gets full later has room for it
         except OSError:
             os.close(file)
             raise
@@ -128,13 +143,13 @@ def _check(generation: int, payload: bytes) -> int:
     return zlib.crc32(payload, zlib.crc32(generation.to_bytes(8, "little")))
 
 
-def _whole(data: bytes) -> Iterator[tuple[int, Kept]]:
+def _whole(data: bytes, slot_bytes: int) -> Iterator[tuple[int, Kept]]:
     """Generation and content of the slots that are whole."""
-    for offset in (0, SLOT_BYTES):
+    for offset in (0, slot_bytes):
         if len(data) < offset + _HEAD.size:
             return
         generation, length, check = _HEAD.unpack_from(data, offset)
-        payload = data[offset + _HEAD.size :][: min(length, SLOT_BYTES - _HEAD.size)]
+        payload = data[offset + _HEAD.size :][: min(length, slot_bytes - _HEAD.size)]
         if generation == 0 or len(payload) != length or _check(generation, payload) != check:
             continue
         try:

@@ -2,11 +2,17 @@
 
     ticks, reward = columns("run/recording.rrd", "/env/reward")
 
+and of each environment of a fleet, or of the only one there is:
+
+    for root in env_roots("run/recording.rrd"):
+        ticks, reward = columns("run/recording.rrd", f"{root}/env/reward")
+
 Times come as int64: ns on `run_time` (since T0) and `wall` (Unix), counts on `tick`, `episode`, `unit`.
 """
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +35,8 @@ LEVEL = "TextLog:level"
 TRANSLATION = "Transform3D:translation"
 QUATERNION = "Transform3D:quaternion"
 DOCUMENT = "TextDocument:text"
+_DIGITS = "0123456789"
+_OF_AN_ENV = re.compile(rf"((?:/[^/]*[{_DIGITS}])?)/(?:env|agent|world)/")  # a root ends with a number
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +106,14 @@ def document(path: str | Path, entity: str = "/run_card") -> str:
 def entities(path: str | Path) -> list[str]:
     """The entities with data, sorted; properties of the recording left out."""
     return sorted({chunk.entity_path for chunk in _chunks(path) if not chunk.entity_path.startswith("/__")})
+
+
+def env_roots(path: str | Path) -> list[str]:
+    """Below which entities those of the environments lie that something was written of: `[""]`, or of a
+    fleet `["/env0", "/env1", ...]`, in the order of their numbers. See `recorder.rows.roots`.
+    """
+    found = {match[1] for entity in entities(path) if (match := _OF_AN_ENV.match(entity))}
+    return sorted(found, key=lambda root: int(root[len(root.rstrip(_DIGITS)) :] or 0))
 
 
 def timelines(path: str | Path, entity: str) -> set[str]:

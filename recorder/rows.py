@@ -2,17 +2,23 @@
 
 Every row stands on all five timelines: `run_time` (ns since T0), `wall` (Unix ns), `tick`, `episode`
 and `unit`. A step brings its own tick, episode and unit; for anything else they follow from the time.
+
+The environments of a fleet have T0, and so `run_time`, `wall` and `tick`, in common; an episode is one
+environment's own.
 """
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rtcore.cast import env_names
+from rtcore.config import EnvConfig
 from rtcore.messages import Spec, Step
 
 Floats = NDArray[np.float64]
@@ -34,6 +40,12 @@ class Index:
 
     def __len__(self) -> int:
         return len(self.run_time_ns)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Index]) -> Index:
+        """The rows of all parts, one after the other."""
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def where(self, mask: NDArray[np.bool_]) -> Index:
         """The rows where `mask` (bool [n]) is true."""
@@ -84,6 +96,17 @@ class Rows:
     payload: Payload
 
 
+def roots(env: EnvConfig) -> dict[str, str]:
+    """By environment, the entity below which its own ones lie: "", or of a fleet `/env0`, `/env1`, ...
+
+    What could not stand in an entity's path is an underscore there; a number ends each name.
+    """
+    names = env_names(env)
+    if len(names) == 1:
+        return {names[0]: ""}
+    return {name: "/" + re.sub(r"[^\w.-]", "_", name, flags=re.ASCII) for name in names}
+
+
 class Timeline:
     """Turns monotonic stamps into places on the five timelines.
 
@@ -115,6 +138,8 @@ class Timeline:
             if not self._episodes or step.episode != self._episodes[-1]:
                 self._episodes.append(step.episode)
                 self._episode_starts_ns.append(step.due_ns - self._t0_ns)
+        if len(self._episodes) > 2 * EPISODES:
+            del self._episodes[:-EPISODES], self._episode_starts_ns[:-EPISODES]
 
     def of_steps(self, steps: Sequence[Step]) -> Index:
         """At their deadlines, with their own tick, episode and unit."""

@@ -8,6 +8,8 @@ import msgspec
 
 KEPT = 4096  # window notices in one message of the learner, which repeats the most
 MARKED = 256  # events in one message
+EVENTS_KEPT = 512  # of one process, which repeats 256 at most
+STATS_KEPT = STATS_MARKED = 16  # of one process, which repeats none: four seconds of disorder
 _NEVER_NS = -(1 << 63)
 
 
@@ -21,10 +23,12 @@ class SeenMark(msgspec.Struct, frozen=True, array_like=True):
 class Seen:
     """Items named by their stamp and a number that tells those of one stamp apart.
 
-    The newest 4096 at least are remembered one by one; what is not newer than a forgotten one counts as seen.
+    The newest `kept` at least are remembered one by one, less than twice as many; what is not newer than a
+    forgotten one counts as seen. `marked` are written down.
     """
 
-    def __init__(self, mark: SeenMark | None = None) -> None:
+    def __init__(self, mark: SeenMark | None = None, *, kept: int = KEPT, marked: int = MARKED) -> None:
+        self._kept, self._marked = kept, marked
         self._begin(mark or SeenMark())
 
     def add(self, at_ns: int, number: int) -> bool:
@@ -34,13 +38,13 @@ class Seen:
             return False
         self._items.add(item)
         insort(self._sorted, item)  # nearly always the last
-        if len(self._sorted) == 2 * KEPT:
-            self._begin(self._newest(KEPT))
+        if len(self._sorted) >= 2 * self._kept:
+            self._begin(self._newest(self._kept))
         return True
 
     def mark(self) -> SeenMark:
-        """The newest 256 items, to go on from."""
-        return self._newest(MARKED)
+        """The newest items, 256 unless told otherwise, to go on from."""
+        return self._newest(self._marked)
 
     def _begin(self, mark: SeenMark) -> None:
         self._floor_ns = mark.floor_ns

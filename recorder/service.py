@@ -3,10 +3,14 @@
 A chunk costs 50-70 us and 2 kB of its own per entity, a row 2 us (measured): so rows wait for each
 other for half a second to a second. A kill -9 loses none of the steps: a later life takes them from the env
 server's log; of the rest it loses what was said in that second and until the recorder is back.
+
+A fleet's environments are written together, each when all have enough rows: they are equally fast, so each
+has its whole chunks, and what is said beside them is cut up no more than with one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from recorder.disk import RecordingFile
@@ -19,6 +23,7 @@ from recorder.sinks import Recording, open_recording
 from recorder.telemetry import TelemetryRows
 from recorder.writer import RunWriter
 from rtcore.bus import Bus
+from rtcore.cast import env_names
 from rtcore.clock import Clock
 from rtcore.config import RunConfig
 from rtcore.ledger import Ledger
@@ -28,10 +33,10 @@ from rtcore.run_dir import RunDir
 
 POLL_S = 0.05
 DRAIN_NS = 2_000_000_000  # after the stop: so long at most for the others' last words
-CHUNK_ROWS = 50  # the knee of cost per row
+CHUNK_ROWS = 50  # the knee of cost per row; of each environment that has any
 MIN_AGE_NS = 500_000_000  # a chunk of so many rows waits at least so long ...
 MAX_AGE_NS = 1_000_000_000  # ... and a smaller one at most so long
-MAX_ROWS = 2_000
+MAX_ROWS = 2_000  # of one environment
 PLACE_NAME = "recorder.place"
 # The file is complete without being compacted, so compaction may take only what an end has to spare:
 # whoever interrupts waits 5 s for all of it, at most 2 of them for the others' last words.
@@ -47,7 +52,7 @@ class RecorderService:
 
     Counts `rows` (written to the file), `dropped` (steps that never came, other messages lost to a full
     queue, and rows that the disk did not take; those alone are `disk_dropped`) and `live_dropped` (rows that
-    the live stream shed; the file has them).
+    the live stream shed; the file has them). In a fleet also `gaps.<env>`, steps that never came.
     """
 
     def __init__(self, config: RunConfig, run_dir: RunDir, bus: Bus, clock: Clock, ledger: Ledger) -> None:
@@ -56,17 +61,18 @@ class RecorderService:
         self._clock = clock
         self._ledger = ledger
         self._telemetry = TelemetryRows()
-        self._intake = Intake(bus, config.env.name, self._telemetry)
+        self._envs = env_names(config.env)
+        self._intake = Intake(bus, self._envs, self._telemetry)
         self._recording: Recording | None = None
         self._writer: RunWriter | None = None
-        self._steps: list[Step] = []
+        self._steps: dict[str, list[Step]] = {env: [] for env in self._envs}
         self._oldest_ns: int | None = None  # when the oldest row that waits came in
-        self._newest_ns = 0  # deadline of the newest step
+        self._newest_ns = 0  # deadline of the newest step of all
         self._due_end_ns: int | None = None  # when the run is to end
         self._stall_told = self._place_told = False
         self._trouble_told = False  # the last word on the disk was that it takes nothing
         self._dropped_told = 0  # when it began to
-        self._gaps_told = 0
+        self._gaps_told = dict.fromkeys(self._envs, 0)
         self._closed = False
 
     def run(self, stop: Stop) -> None:
@@ -81,33 +87,30 @@ class RecorderService:
     def poll(self) -> None:
         """Take in what has come; write it when there is enough of it, or when it has waited enough."""
         recording = self._open()
-        spec = self._intake.take_spec()
-        if spec is not None and self._writer is None:
-            self._writer = self._begin(recording, spec)
-            if self._config.duration_s:
-                self._due_end_ns = spec.t0_ns + round(self._config.duration_s * 1e9)
+        for env, spec in self._intake.take_specs().items():
+            self._begin(recording, env, spec)
         now_ns = self._clock.now_ns()
         self._ledger.beat(now_ns)
-        self._steps += self._intake.take_steps(now_ns)
-        if self._steps:
-            self._newest_ns = self._steps[-1].due_ns
+        self._keep(self._intake.take_steps(now_ns))
         news = self._intake.take_telemetry()
-        if self._oldest_ns is None and (self._steps or news):
+        waiting = [len(steps) for steps in self._steps.values() if steps]
+        if self._oldest_ns is None and (waiting or news):
             self._oldest_ns = now_ns
         if self._oldest_ns is not None:
             age_ns = now_ns - self._oldest_ns
-            enough = len(self._steps) >= CHUNK_ROWS and age_ns >= MIN_AGE_NS
-            if enough or age_ns >= MAX_AGE_NS or len(self._steps) >= MAX_ROWS:
+            enough = min(waiting, default=0) >= CHUNK_ROWS and age_ns >= MIN_AGE_NS
+            if enough or age_ns >= MAX_AGE_NS or max(waiting, default=0) >= MAX_ROWS:
                 self.flush()
 
     def flush(self) -> None:
-        """Write all that has been taken in."""
+        """Write all that has been taken in, of the environments that have declared themselves."""
         if self._writer is None or self._recording is None:
             return
-        self._writer.write(self._steps, self._telemetry, self._intake.placements)
-        self._steps = []
+        steps = {env: self._steps[env] for env in self._writer.begun}
+        self._writer.write(steps, self._telemetry, self._intake.placements)
+        self._steps |= {env: [] for env in steps}
         self._oldest_ns = None
-        self._sync(self._recording, self._writer.place(self._intake.position, self._telemetry.told))
+        self._sync(self._recording, self._writer.place(self._intake.positions, self._telemetry.told))
         live = self._recording.live
         if live is not None and not live.pump() and not self._stall_told:
             self._stall_told = True
@@ -121,13 +124,17 @@ class RecorderService:
         self._closed = True
         recording = self._open()
         self.poll()
-        self._steps += self._intake.give_up_on_gaps()
+        self._keep(self._intake.give_up_on_gaps())
         recording.file.insist()
         self.flush()
         if self._writer is None:
             self._sync(recording, recording.file.place)
             if recording.file.part is None:
                 self._say("WARN", "no env server ever declared itself: the recording is empty")
+        else:
+            for env in self._envs:
+                if env not in recording.file.place.envs:
+                    self._say("WARN", f"{env} never declared itself: the recording has nothing of it")
         recording.close()
         self._account(recording)
         done = self._due_end_ns is not None and self._newest_ns >= self._due_end_ns - LAST_S_NS
@@ -148,7 +155,8 @@ class RecorderService:
     def _open(self) -> Recording:
         if self._recording is None:
             run_dir, run = self._run_dir, self._run_dir.run_name
-            file = RecordingFile(run_dir.recording_path, run_dir.logs_dir / PLACE_NAME, self._clock)
+            place_path = run_dir.logs_dir / PLACE_NAME
+            file = RecordingFile(run_dir.recording_path, place_path, self._clock, len(self._envs))
             file.resume()
             self._intake.go_on_from(file.place)
             self._telemetry.go_on_from(file.place.told)
@@ -187,10 +195,22 @@ class RecorderService:
             self._dropped_told = recording.dropped
             self._say("WARN", f"the disk takes rows again; {dropped} were dropped")
 
-    def _begin(self, recording: Recording, spec: Spec) -> RunWriter:
-        scene = self._scene(spec) if self._config.recorder.detail == "full" else None
-        place = recording.file.place
-        return RunWriter(self._config, self._run_dir.run_name, recording, spec, scene, place)
+    def _begin(self, recording: Recording, env: str, spec: Spec) -> None:
+        """Write of an environment that has declared itself; with the first one the writing begins."""
+        if self._writer is None:
+            scene = self._scene(spec) if self._config.recorder.detail == "full" else None
+            name, place = self._run_dir.run_name, recording.file.place
+            self._writer = RunWriter(self._config, name, recording, spec, scene, place)
+            if self._config.duration_s:
+                self._due_end_ns = spec.t0_ns + round(self._config.duration_s * 1e9)
+        self._writer.begin(env, spec)
+
+    def _keep(self, taken: Mapping[str, list[Step]]) -> None:
+        """Have steps wait until they are written."""
+        for env, steps in taken.items():
+            self._steps[env] += steps
+            if steps:
+                self._newest_ns = max(self._newest_ns, steps[-1].due_ns)
 
     def _scene(self, spec: Spec) -> Scene | None:
         if spec.scene == "point":
@@ -209,10 +229,14 @@ class RecorderService:
         self._ledger.set_counter("dropped", self._intake.dropped + recording.dropped)
         self._ledger.set_counter("disk_dropped", recording.dropped)
         self._ledger.set_counter("live_dropped", recording.live.dropped if recording.live else 0)
-        lost = self._intake.gaps - self._gaps_told
-        if lost:
-            self._gaps_told += lost
-            self._say("WARN", f"{lost} steps never came: their ticks are missing from the recording")
+        for env, gaps in self._intake.gaps.items():
+            fleet = len(self._envs) > 1
+            if fleet:
+                self._ledger.set_counter(f"gaps.{env}", gaps)
+            if lost := gaps - self._gaps_told[env]:
+                self._gaps_told[env] = gaps
+                text = f"{lost} steps never came: their ticks are missing from the recording"
+                self._say("WARN", f"{env}: {text}" if fleet else text)
 
     def _say(self, level: Literal["INFO", "WARN"], text: str) -> None:
         self._ledger.event(self._clock.now_ns(), level, text)

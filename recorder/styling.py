@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,9 +16,14 @@ from rtcore.messages import CAUSES
 
 BLUE, ORANGE, GREEN = 0x4E9BFFFF, 0xFFA23AFF, 0x3ECF8EFF
 RED, PURPLE, GREY, YELLOW = 0xFF5A5FFF, 0xB18CFFFF, 0x9AA4B2FF, 0xFFE066FF
+WHITE, CYAN, PINK, LIME = 0xF2F4F8FF, 0x40D8E0FF, 0xFF8AC4FF, 0xA6D64AFF
+FLEET = (BLUE, ORANGE, GREEN, PURPLE, CYAN, PINK, YELLOW, LIME)  # by environment; then `GOLDEN` goes on
+GOLDEN = 0.61803  # of the circle from one hue to the next: they never meet
 DOT_SIZE = 3.0
 JUDGED = ("last_error", "last_baseline_error", "trust")  # of the forecast's gauges
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
+
+PUBLISHED = "/learner/published_version"
 
 Drawing = Literal["Average", "Max", "Steps", "Dots", "Line and dots"]
 
@@ -51,7 +57,7 @@ LOOKS: dict[str, Look] = {
         for cause, colour in zip(CAUSES, (GREY, PURPLE, ORANGE, GREEN, YELLOW, BLUE, RED), strict=True)
     },
     "/agent/policy_version": Look(("acting",), (ORANGE,), "Steps"),
-    "/learner/published_version": Look(("published",), (BLUE,), "Dots"),
+    PUBLISHED: Look(("published",), (BLUE,), "Dots"),
     "/learner/schedule/update": Look(("update G",), (BLUE,), "Steps"),
     "/learner/schedule/hold": Look(("hold N",), (ORANGE,), "Steps"),
     "/learner/loss/critic": Look(("critic",), (BLUE,)),
@@ -89,10 +95,14 @@ def forecast_look(names: Sequence[str]) -> Look:
     return Look(tuple(names), colours, hidden=tuple(name not in JUDGED for name in names))
 
 
-def static_looks(*, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:
-    """Everything that can be said before the first row; `FORECAST` follows when its series are known."""
-    static = {entity: looks(look) for entity, look in LOOKS.items()}
-    static["/env/drift"] = looks(TARGET_AND_SPEED if drift_is_speed else TARGET)
+def learner_looks(*, fleet: bool = False) -> dict[str, list[rr.AsComponents]]:
+    """What can be said of the learner's entities before their first rows; `FORECAST` follows when its series
+    are known. In a fleet the colours are the environments' where both are in one view.
+    """
+    own = {entity: look for entity, look in LOOKS.items() if entity.startswith("/learner/")}
+    if fleet:
+        own[PUBLISHED] = replace(own[PUBLISHED], colours=(WHITE,))
+    static = {entity: looks(look) for entity, look in own.items()}
     static["/learner/phase"] = [
         rr.StateConfiguration(
             values=["update", "hold"],
@@ -102,3 +112,45 @@ def static_looks(*, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:
     ]
     assert FORECAST not in static
     return static
+
+
+def env_looks(*, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:
+    """Of the only environment's entities, and its agent's."""
+    static = {entity: looks(look) for entity, look in LOOKS.items() if not entity.startswith("/learner/")}
+    static["/env/drift"] = looks(TARGET_AND_SPEED if drift_is_speed else TARGET)
+    return static
+
+
+def fleet_looks(env: str, index: int, *, drift_is_speed: bool) -> dict[str, list[rr.AsComponents]]:
+    """Of one environment of a fleet: series of a kind share a view, so they are told apart by the name and a
+    colour of their environment, the same in every view.
+
+    What is the same for all, such as the target, is drawn once, for the first.
+    """
+    colour = fleet_colour(index)
+    own = {entity: _one_of_many(look, env, colour) for entity, look in LOOKS.items()}
+    causes = {
+        f"{MISSED}/{cause}": replace(LOOKS[f"{MISSED}/{cause}"], names=(f"{env} {cause}",))
+        for cause in CAUSES
+    }
+    drift = TARGET
+    if drift_is_speed:
+        drift = Look(("target", env), (WHITE, colour), hidden=(index > 0, False))
+    kept = {PHYSICS: LOOKS[PHYSICS], **causes, "/env/drift": drift}
+    return {
+        entity: looks(look) for entity, look in (own | kept).items() if not entity.startswith("/learner/")
+    }
+
+
+def _one_of_many(look: Look, env: str, colour: int) -> Look:
+    return replace(look, names=(env,), colours=(colour,))
+
+
+def fleet_colour(index: int) -> int:
+    """RGBA; neighbours differ most. Each hue comes once, and those of the first eight lie apart widely."""
+    return FLEET[index] if index < len(FLEET) else _hue(index)
+
+
+def _hue(index: int) -> int:
+    red, green, blue = colorsys.hsv_to_rgb(index * GOLDEN % 1.0, 0.45, 0.95)
+    return int.from_bytes((round(255 * red), round(255 * green), round(255 * blue), 255))

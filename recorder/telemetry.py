@@ -8,37 +8,43 @@ from __future__ import annotations
 
 import zlib
 from collections import defaultdict
+from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
 from recorder.place import Told
-from recorder.rows import Lines, Rows, Scalars, States, Timeline
-from recorder.seen import Seen
+from recorder.rows import Index, Lines, Rows, Scalars, States, Timeline
+from recorder.seen import EVENTS_KEPT, STATS_KEPT, STATS_MARKED, Seen
+from rtcore.cast import index_of, role_of
 from rtcore.channels import LEARNER
 from rtcore.messages import Level, Policy, Stats, WindowNotice
 
 FORECAST = "/learner/forecast"
+OF_ONE: Mapping[int, Timeline] = {}
+_STATS = partial(Seen, kept=STATS_KEPT, marked=STATS_MARKED)
+_EVENTS = partial(Seen, kept=EVENTS_KEPT)
 
 
 class TelemetryRows:
     """Collects messages, and gives their rows when asked: by then the steps before them are known."""
 
     def __init__(self) -> None:
-        self._lines: list[tuple[int, Level, str]] = []
+        self._lines: list[tuple[int, Level, str, int | None]] = []  # the last: of which environment
         self._gauges: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
         self._forecasts: list[tuple[int, dict[str, float]]] = []
         self._phases: list[tuple[int, str]] = []
         self._versions: list[tuple[int, int]] = []
-        self._stats_seen: defaultdict[str, Seen] = defaultdict(Seen)
-        self._events_seen: defaultdict[str, Seen] = defaultdict(Seen)
+        self._stats_seen: defaultdict[str, Seen] = defaultdict(_STATS)
+        self._events_seen: defaultdict[str, Seen] = defaultdict(_EVENTS)
         self._notices_seen = Seen()
         self._policies_seen = Seen()
         self.forecast_names: list[str] = []  # series of `FORECAST`, in the order of the row; grows
 
     def go_on_from(self, told: Told) -> None:
         """Begin where an earlier life of the recorder ended. Call it before anything is taken."""
-        self._stats_seen.update({name: Seen(mark) for name, mark in told.stats.items()})
-        self._events_seen.update({name: Seen(mark) for name, mark in told.events.items()})
+        self._stats_seen.update({name: _STATS(mark) for name, mark in told.stats.items()})
+        self._events_seen.update({name: _EVENTS(mark) for name, mark in told.events.items()})
         self._notices_seen = Seen(told.notices)
         self._policies_seen = Seen(told.policies)
         self.forecast_names = list(told.forecast_names)
@@ -62,10 +68,11 @@ class TelemetryRows:
         prefix = f"{stats.process}: "  # some name themselves
         for event in stats.events:
             if seen.add(event.at_ns, zlib.crc32(event.text.encode())):
-                self.line(event.at_ns, event.level, f"[{stats.process}] {event.text.removeprefix(prefix)}")
+                text = f"[{stats.process}] {event.text.removeprefix(prefix)}"
+                self._lines.append((event.at_ns, event.level, text, index_of(stats.process)))
         for notice in stats.windows:
             self.window(notice)
-        if stats.process == LEARNER:
+        if role_of(stats.process) == LEARNER:
             self._take_gauges(stats)
 
     def window(self, notice: WindowNotice) -> None:
@@ -76,23 +83,25 @@ class TelemetryRows:
         self._phases.append((notice.at_ns, notice.phase))
         if notice.reason == "operator":
             what = "holds the policy" if notice.phase == "hold" else "resumes the schedule"
-            self._lines.append((notice.at_ns, "INFO", f"[operator] {what} in window {notice.window}"))
+            text = f"[operator] {what} in window {notice.window}"
+            self._lines.append((notice.at_ns, "INFO", text, None))
 
     def policy(self, policy: Policy) -> None:
         """Take a published iterate."""
         if self._policies_seen.add(policy.created_ns, policy.version):
             self._versions.append((policy.created_ns, policy.version))
 
-    def line(self, at_ns: int, level: Level, text: str) -> None:
-        """Take a line for the log."""
-        self._lines.append((at_ns, level, text))
+    def rows(self, timeline: Timeline, of_envs: Mapping[int, Timeline] = OF_ONE) -> list[Rows]:
+        """Everything taken since the last call.
 
-    def rows(self, timeline: Timeline) -> list[Rows]:
-        """Everything taken since the last call."""
+        Args:
+            timeline: of what is no environment's own.
+            of_envs: a fleet's, by the environment's index, for what its own processes say; those that have
+                not declared themselves yet may be missing.
+        """
         tables: list[Rows] = []
         if self._lines:
-            at_ns, levels, texts = zip(*self._lines, strict=True)
-            tables.append(Rows("/log", timeline.of_stamps(at_ns), Lines(texts, levels)))
+            tables.append(self._line_rows(timeline, of_envs))
         if self._phases:
             at_ns, names = zip(*self._phases, strict=True)
             tables.append(Rows("/learner/phase", timeline.of_stamps(at_ns), States(names)))
@@ -115,6 +124,14 @@ class TelemetryRows:
         if forecasts:
             self._forecasts.append((stats.at_ns, forecasts))
             self.forecast_names += sorted(forecasts.keys() - set(self.forecast_names))
+
+    def _line_rows(self, timeline: Timeline, of_envs: Mapping[int, Timeline]) -> Rows:
+        at_ns, levels, texts, envs = zip(*self._lines, strict=True)
+        owners = [timeline if env is None else of_envs.get(env, timeline) for env in envs]
+        if all(owner is timeline for owner in owners):
+            return Rows("/log", timeline.of_stamps(at_ns), Lines(texts, levels))
+        single = [owner.of_stamps([at]) for owner, at in zip(owners, at_ns, strict=True)]
+        return Rows("/log", Index.joined(single), Lines(texts, levels))
 
     def _forecast_rows(self, timeline: Timeline) -> Rows:
         index = timeline.of_stamps([at_ns for at_ns, _ in self._forecasts])

@@ -53,7 +53,7 @@ def test_it_says_nothing_until_something_happens_and_then_at_once_and_on() -> No
 
 def test_the_recorder_does_not_wait_for_its_last_words() -> None:
     stage = Stage()
-    intake = Intake(stage.hub.bus(RECORDER, stage.clock), "env0", TelemetryRows())
+    intake = Intake(stage.hub.bus(RECORDER, stage.clock), ("env0",), TelemetryRows())
     stage.hub.bus(channels.ENV_SERVER, stage.clock).publisher(channels.LOG, "env0").put(
         StepBatch(steps=[], last=True)
     )

@@ -15,7 +15,7 @@ import rerun as rr
 from recorder import reading
 from recorder.disk import RETRY_NS, RecordingFile, unframed
 from recorder.finish import MAGIC, parts_of
-from recorder.place import Kept, Place, PlaceFile
+from recorder.place import EnvPlace, Kept, Place, PlaceFile
 from rtcore.clock import VirtualClock
 from tests.recorder.stage import SPEC, Stage, come_back, make_step, set_stage
 
@@ -55,6 +55,10 @@ def fill(directory: Path) -> Path:
 def record(stage: Stage, *seqs: int) -> None:
     stage.steps([make_step(seq) for seq in range(*seqs)], size=10)
     stage.service.flush()
+
+
+def at(seq: int) -> Place:
+    return Place({"env0": EnvPlace((1, seq))})
 
 
 def texts(stage: Stage) -> list[str]:
@@ -149,16 +153,16 @@ def test_a_piece_that_fits_in_part_is_taken_back(small_disk: Path) -> None:
     file = RecordingFile(path, small_disk / "place", clock)
     file.resume()
     assert file.append(b"a" * 1000, Place())
-    assert not file.append(b"b" * 4_000_000, Place(log=(1, 5)))  # 2 MB of it would fit
+    assert not file.append(b"b" * 4_000_000, at(5))  # 2 MB of it would fit
     assert path.read_bytes() == b"a" * 1000
-    assert not file.append(b"c" * 10, Place(log=(1, 6)))  # no attempt so soon
+    assert not file.append(b"c" * 10, at(6))  # no attempt so soon
     clock.advance_ns(RETRY_NS)
-    assert file.append(b"d" * 10, Place(log=(1, 7)))
+    assert file.append(b"d" * 10, at(7))
     file.close()
     assert path.read_bytes() == b"a" * 1000 + b"d" * 10
     later = RecordingFile(path, small_disk / "place", clock)
     later.resume()
-    assert later.place == Place(log=(1, 7))
+    assert later.place == at(7)
 
 
 def test_a_new_file_counts_for_nothing_before_its_first_place(
@@ -166,7 +170,7 @@ def test_a_new_file_counts_for_nothing_before_its_first_place(
 ) -> None:
     path, place_path, clock = tmp_path / "recording.rrd", tmp_path / "place", VirtualClock()
     first = RecordingFile(path, place_path, clock)
-    assert first.append(b"a" * 10, Place(log=(1, 1)))
+    assert first.append(b"a" * 10, at(1))
     first.close()
     keep, calls = PlaceFile.keep, []
 
@@ -180,12 +184,12 @@ def test_a_new_file_counts_for_nothing_before_its_first_place(
     second = RecordingFile(path, place_path, clock)
     second.resume()
     with pytest.raises(KeyboardInterrupt):
-        second.append(b"b" * 10, Place(log=(1, 2)))
+        second.append(b"b" * 10, at(2))
     assert path.read_bytes() == b"b" * 10
     third = RecordingFile(path, place_path, clock)
     third.resume()
-    assert third.place == Place(log=(1, 1))
-    assert third.append(b"c" * 10, Place(log=(1, 2)))
+    assert third.place == at(1)
+    assert third.append(b"c" * 10, at(2))
     assert path.read_bytes() == b"c" * 10
     assert [part.read_bytes() for part in parts_of(path)] == [b"a" * 10]
 

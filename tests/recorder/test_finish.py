@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,8 @@ from typing import TypeVar
 import pytest
 
 from recorder import finish, reading
-from recorder.finish import FinishError, run_cli
+from recorder.finish import FinishError, TooSlowError, run_cli
+from recorder.frames import MESSAGE_HEAD, STREAM_HEAD
 
 T = TypeVar("T")
 
@@ -128,6 +130,39 @@ def test_what_a_killed_finish_left_is_removed_and_what_another_is_at_is_not(tmp_
     with pytest.raises(FinishError, match="nothing was written"):
         finish.finish(tmp_path / "recording.rrd")
     assert [left.name for left in tmp_path.iterdir()] == [f".recording.finishing-{os.getppid()}"]
+
+
+def test_without_the_time_for_more_the_parts_are_joined_all_the_same(tmp_path: Path) -> None:
+    path, written = killed(tmp_path, after=100)
+    whole = reading.columns(path, "/env/reward")[0].tolist()
+    path.rename(part := path.with_name("recording.part000.rrd"))
+    messages = part.read_bytes()[STREAM_HEAD:]
+    later = part.read_bytes()[:STREAM_HEAD] + messages
+    path.write_bytes(later + MESSAGE_HEAD.pack(7, 1000) + b"torn")
+    with pytest.raises(TooSlowError):
+        finish.finish(path, timeout_s=0.01)
+    assert not finish.parts_of(path)
+    assert not list(path.parent.glob(".recording*"))
+    assert path.read_bytes() == later + messages
+    ticks = reading.columns(path, "/env/reward")[0].tolist()
+    assert len(whole) >= written
+    assert ticks == sorted(2 * whole)  # the part, and what was written after it
+
+
+def test_what_no_machine_manages_in_that_time_is_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(finish.MAGIC)
+    os.truncate(path, 900_000_000)  # takes no room
+    monkeypatch.setattr(finish, "run_cli", lambda *_, **__: pytest.fail("begun"))
+    with pytest.raises(TooSlowError, match=re.escape("900 MB take over 10 s")):
+        finish.finish(path, timeout_s=10.0)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["recording.rrd"]
+    patience: list[float] = []
+    monkeypatch.setattr(finish, "finish", lambda _, *, timeout_s: patience.append(timeout_s))
+    assert finish.main([str(path)]) == 0
+    assert patience == [225.0]  # 4 MB/s
 
 
 def test_the_time_is_for_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,8 @@ from tests.recorder.killed_child import main as live
 from tests.recorder.stage import SPEC, come_back, make_step, set_stage
 
 
-def die(directory: Path, what: str, n: int) -> int:
-    command = [sys.executable, "-m", "tests.recorder.killed_child", str(directory), what, str(n)]
+def die(directory: Path, what: str, n: int, envs: int = 1) -> int:
+    command = [sys.executable, "-m", "tests.recorder.killed_child", str(directory), what, str(n), str(envs)]
     return subprocess.run(command, cwd=Path.cwd(), check=False).returncode
 
 
@@ -54,6 +54,19 @@ def test_rows_of_a_recorder_that_is_killed_again_and_again_are_those_of_one_that
     assert rows(path) == expected
     assert reading.columns(path, "/env/reward")[0].tolist() == list(range(STEPS))
     assert reading.series(path, "/learner/forecast") == ["a", "b0", "b1", "b2"]
+
+
+def test_so_are_those_of_each_environment_of_a_fleet(tmp_path: Path) -> None:
+    live(str(tmp_path / "undisturbed"), "never", "0", "3")
+    for what, n in (("recorded", 3), ("place", 4)):
+        assert die(tmp_path / "killed", what, n, envs=3) == -signal.SIGKILL
+    live(str(tmp_path / "killed"), "never", "0", "3")
+    path = tmp_path / "killed" / "runs" / "r1" / "recording.rrd"
+    expected = rows(tmp_path / "undisturbed" / "runs" / "r1" / "recording.rrd")
+    assert set(expected.values()) == {1}
+    assert rows(path) == expected
+    for root in reading.env_roots(path):
+        assert reading.columns(path, f"{root}/env/reward")[0].tolist() == list(range(STEPS)), root
 
 
 def test_a_killed_finish_neither_loses_nor_doubles_a_row(
