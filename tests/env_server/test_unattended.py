@@ -5,9 +5,12 @@ from __future__ import annotations
 import signal
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -26,6 +29,7 @@ HOLD_TICKS = 12
 ENV = EnvConfig(id="pointmass", hz=100.0, episode_steps=500, start_wait_s=5.0, hold_ticks=HOLD_TICKS)
 CONFIG = RunConfig(env=resolve(ENV), agent=AgentConfig(rt="off"), recorder=RecorderConfig(record=False))
 ARCHITECTURE = Architecture(kind="tanh_gaussian_mlp", observation_dim=1, action_dim=1, hidden=[4])
+FALLBACKS: tuple[MissPolicy, ...] = get_args(MissPolicy)
 HELD = np.tanh(np.float32(0.5))  # the policy's action, whatever is observed; the bounds are -1 and 1
 
 
@@ -57,26 +61,52 @@ def fallbacks(steps: list[Step]) -> list[str]:
     return [step.fallback for step in steps]
 
 
-@pytest.mark.parametrize("on_miss", ["hold", "neutral", "hold_then_neutral"])
-def test_without_its_agent_the_world_goes_on_with_the_declared_fallback(
-    tmp_path: Path, on_miss: MissPolicy
-) -> None:
-    with attended(tmp_path / "run", on_miss) as on:
+@dataclass(frozen=True)
+class Unattended:
+    """The steps of a world whose agent was killed and came back with a newer policy."""
+
+    steps: list[Step]
+    killed_ns: int
+    began_ns: int
+
+
+def lose_the_agent(path: Path, on_miss: MissPolicy) -> Unattended:
+    with attended(path, on_miss) as on:
         killed_ns = on.send(AGENT, signal.SIGKILL)
         on.watch(0.4)
         write_atomic(on.run.policy_path, msgspec.msgpack.encode(published(4)))
         began_ns = on.start(AGENT)
         on.watch_until(lambda: any(step.due_ns > began_ns for step in answered(on.steps)))
-    first = next(step for step in answered(on.steps) if step.due_ns > began_ns)
-    alone = [step for step in on.steps if step.missed and killed_ns < step.due_ns < first.due_ns]
+        return Unattended(on.steps, killed_ns, began_ns)
+
+
+@pytest.fixture(scope="module")
+def worlds(tmp_path_factory: pytest.TempPathFactory) -> dict[MissPolicy, Future[Unattended]]:
+    """One for each fallback, all at once: they mostly wait."""
+    with ThreadPoolExecutor(len(FALLBACKS)) as pool:
+        return {
+            name: pool.submit(lose_the_agent, tmp_path_factory.mktemp(name) / "run", name)
+            for name in FALLBACKS
+        }
+
+
+@pytest.mark.parametrize("on_miss", FALLBACKS)
+def test_without_its_agent_the_world_goes_on_with_the_declared_fallback(
+    worlds: dict[MissPolicy, Future[Unattended]], on_miss: MissPolicy
+) -> None:
+    world = worlds[on_miss].result()
+    steps, killed_ns, began_ns = world.steps, world.killed_ns, world.began_ns
+    first = next(step for step in answered(steps) if step.due_ns > began_ns)
+    alone = [step for step in steps if step.missed and killed_ns < step.due_ns < first.due_ns]
     assert sum(1 + step.skipped for step in alone) >= 35
     assert {step.cause for step in alone if step.due_ns > killed_ns + TICK_NS} == {"agent_absent"}
-    assert not [step for step in answered(on.steps) if killed_ns + TICK_NS < step.due_ns < began_ns]
+    assert not [step for step in answered(steps) if killed_ns + TICK_NS < step.due_ns < began_ns]
     found = fallbacks(alone)
-    held = {"hold": len(found), "neutral": 0, "hold_then_neutral": HOLD_TICKS}[on_miss]
-    missed_before = fallbacks([step for step in on.steps if step.missed and step.due_ns <= killed_ns])
-    if not missed_before:  # else some of the ticks to be held were used up before
-        assert found == ["hold"] * held + ["neutral"] * (len(found) - held)
+    before = [step for step in steps if step.due_ns <= killed_ns]
+    fallbacks([step for step in before if step.missed])
+    in_a_row = sum(1 for _ in takewhile(lambda step: step.missed, reversed(before)))  # held already
+    held = {"hold": len(found), "neutral": 0, "hold_then_neutral": max(0, HOLD_TICKS - in_a_row)}[on_miss]
+    assert found == ["hold"] * held + ["neutral"] * (len(found) - held)
     assert first.policy_version == 4  # the new agent's first answer, with the newest policy and never pi_0
 
 

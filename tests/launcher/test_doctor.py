@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -176,12 +177,34 @@ def test_facts_of_this_machine_leave_nothing_behind(tmp_path: Path) -> None:
     assert gather(Path("/proc")).sync_ms is None
 
 
-def test_the_real_command(tmp_path: Path) -> None:
-    done = tenuto("doctor", "--seconds", "1.2", cwd=tmp_path)
+@dataclass(frozen=True)
+class Told:
+    """What the commands below said, and where."""
+
+    place: Path
+    measured: subprocess.CompletedProcess[str]
+    foretold: subprocess.CompletedProcess[str]
+    refused: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
+    """Side by side: the one that measures mostly waits."""
+    place, other = tmp_path_factory.mktemp("doctor"), tmp_path_factory.mktemp("without")
+    with ThreadPoolExecutor(1) as pool:
+        measured = pool.submit(tenuto, "doctor", "--seconds", "1.2", cwd=place)
+        foretold = without_privileges("doctor", "--seconds", "0", cwd=other)
+        arguments = ["env", "pointmass", "--agent.rt", "require", "--run-dir", "run"]
+        refused = without_privileges(*arguments, cwd=other)
+        return Told(place, measured.result(), foretold, refused)
+
+
+def test_the_real_command(told: Told) -> None:
+    done = told.measured
     granted = 'agent.rt = "require" is granted here' in done.stdout
     assert done.returncode == (0 if granted else 1), done.stderr
     assert "SCHED_FIFO" in done.stdout and "round trip" in done.stdout and "without any of it" in done.stdout
-    assert list(tmp_path.iterdir()) == []
+    assert list(told.place.iterdir()) == []
 
 
 def without_privileges(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -192,15 +215,12 @@ def without_privileges(*arguments: str, cwd: Path) -> subprocess.CompletedProces
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=30, check=False)
 
 
-def test_without_privileges_it_foretells_what_require_does(tmp_path: Path) -> None:
-    told = without_privileges("doctor", "--seconds", "0", cwd=tmp_path)
-    assert told.returncode == 1
-    assert "is refused here for want of SCHED_FIFO, locked memory" in told.stdout
-    assert "prlimit" in told.stdout or "docker run --cap-add SYS_NICE" in told.stdout
-    arguments = ["env", "pointmass", "--agent.rt", "require", "--run-dir", "run"]
-    refused = without_privileges(*arguments, cwd=tmp_path)
-    assert refused.returncode == 2
-    assert "env_server is refused SCHED_FIFO, locked memory" in refused.stderr
+def test_without_privileges_it_foretells_what_require_does(told: Told) -> None:
+    assert told.foretold.returncode == 1
+    assert "is refused here for want of SCHED_FIFO, locked memory" in told.foretold.stdout
+    assert "prlimit" in told.foretold.stdout or "docker run --cap-add SYS_NICE" in told.foretold.stdout
+    assert told.refused.returncode == 2
+    assert "env_server is refused SCHED_FIFO, locked memory" in told.refused.stderr
 
 
 def test_wrong_input(tmp_path: Path) -> None:

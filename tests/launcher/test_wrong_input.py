@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -102,12 +106,34 @@ OTHERS = {
         ["run", "bandit", "--env.notify", "value"],
         ["env.notify", "'value'"],
     ),
+    "index_missing": (
+        ["env", "pointmass", "--env.count", "3", "--run-dir", "new"],
+        ["index", "None", "0..2", "env.count = 3"],
+    ),
+    "index_too_high": (
+        ["agent", "pointmass", "--env.count", "3", "--index", "3", "--run-dir", "new"],
+        ["index", "3", "0..2"],
+    ),
+    "index_of_a_learner": (
+        ["learn", "pointmass", "--env.count", "3", "--index", "0", "--run-dir", "new"],
+        ["index", "0", "one learner"],
+    ),
+    "index_of_the_only_one": (
+        ["env", "pointmass", "--index", "1", "--run-dir", "new"],
+        ["index", "1", "one"],
+    ),
+    "index_is_no_number": (["env", "pointmass", "--index", "x", "--run-dir", "new"], ["index", "'x'"]),
+    "too_many_environments": (["run", "pointmass", "--env.count", "17"], ["env.count", "17", "1..16"]),
     "report_of_nothing": (["report"], ["run", "must be given"]),
 }
 
 
 @pytest.fixture
 def somewhere(tmp_path: Path) -> Path:
+    return furnished(tmp_path)
+
+
+def furnished(tmp_path: Path) -> Path:
     """A directory with what the mistakes refer to."""
     (tmp_path / "taken").mkdir()
     (tmp_path / "file").write_text("")
@@ -120,15 +146,36 @@ def somewhere(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@dataclass(frozen=True)
+class Refused:
+    """What a command said, and what lay around it before and after."""
+
+    done: subprocess.CompletedProcess[str]
+    before: set[Path]
+    after: set[Path]
+
+
+@pytest.fixture(scope="module")
+def typed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Future[Refused]]:
+    """All of `TYPED`, as many at once as there are cores."""
+
+    def refuse(name: str, place: Path) -> Refused:
+        before = tree(place)
+        done = tenuto(*TYPED[name][0], cwd=place)
+        return Refused(done, before, tree(place))
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return {name: pool.submit(refuse, name, furnished(tmp_path_factory.mktemp(name))) for name in TYPED}
+
+
+@pytest.mark.timeout(120)  # the first waits for all
 @pytest.mark.parametrize("name", TYPED)
-def test_wrong_input_is_one_line_and_leaves_nothing(name: str, somewhere: Path) -> None:
-    arguments, words = TYPED[name]
-    before = tree(somewhere)
-    done = tenuto(*arguments, cwd=somewhere)
-    assert done.returncode == 2, done.stderr
-    assert done.stdout == ""
-    check_line(done.stderr, words)
-    assert tree(somewhere) == before
+def test_wrong_input_is_one_line_and_leaves_nothing(name: str, typed: dict[str, Future[Refused]]) -> None:
+    found = typed[name].result()
+    assert found.done.returncode == 2, found.done.stderr
+    assert found.done.stdout == ""
+    check_line(found.done.stderr, TYPED[name][1])
+    assert found.after == found.before
 
 
 @pytest.mark.parametrize("name", OTHERS)

@@ -29,6 +29,8 @@ from rtcore.messages import (
 )
 from rtcore.monotonic import MonotonicClock
 from rtcore.zenoh_bus import ZenohBus, open_bus
+from rtcore.zenoh_config import CLIENT, session_config
+from rtcore.zenoh_session import open_session
 
 ENV = "env0"
 PATIENCE_S = 10.0  # a test that waits longer has failed
@@ -65,6 +67,7 @@ class ZenohWorld:
     def __init__(self, socket_dir: Path) -> None:
         self.socket_dir = socket_dir
         self._opened: list[ZenohBus] = []
+        self._intruders: list[Any] = []
 
     def bus(self, role: str) -> ZenohBus:
         bus = open_bus(role, self.RUN, self.socket_dir, clock=MonotonicClock())
@@ -74,14 +77,17 @@ class ZenohWorld:
     def inject(self, key: str, payload: bytes) -> None:
         import zenoh
 
-        intruder = self.bus("client")
-        session = intruder._session
+        settings: Any = session_config(CLIENT, self.RUN, self.socket_dir)
+        connect = settings["connect"]  # opening waits for those who are not there
+        connect["endpoints"] = [one for one in connect["endpoints"] if Path(one.partition("/")[2]).exists()]
+        session = open_session(settings)
+        self._intruders.append(session)
         publisher: Any = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
         assert eventually(lambda: publisher.matching_status.matching)
         publisher.put(payload)
 
     def close(self) -> None:
-        for bus in self._opened:
+        for bus in (*self._intruders, *self._opened):
             bus.close()
 
 

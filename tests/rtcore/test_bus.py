@@ -1,4 +1,7 @@
-"""What every bus delivers: the same tests for the in-memory one and for Zenoh."""
+"""What every bus delivers: the same tests for the in-memory one and for Zenoh.
+
+Roles are those whose Zenoh sessions open at once: the env server waits for nobody, the agent for it alone.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ from tests.rtcore.bus_samples import (
 
 
 def test_every_channel_carries_its_message_unchanged(world: World) -> None:
-    sender, receiver = world.bus(ENV_SERVER), world.bus(RECORDER)
+    sender, receiver = world.bus(ENV_SERVER), world.bus(AGENT)
     assert {channel.name for channel in channels.TABLE} == set(SAMPLES)
     for channel in channels.TABLE:
         untyped: Channel[Any] = channel
@@ -47,7 +50,7 @@ def test_every_channel_carries_its_message_unchanged(world: World) -> None:
 
 
 def test_a_process_hears_itself(world: World) -> None:
-    bus = world.bus(AGENT)
+    bus = world.bus(ENV_SERVER)
     reader = bus.latest(STATS, "*")
     bus.publisher(STATS, AGENT).put(stats(AGENT))
     received = reader.wait(5.0)
@@ -95,7 +98,7 @@ def test_who_attends_answers_on_the_thread_that_receives(world: World) -> None:
 
 
 def test_only_what_cannot_wait_is_attended_and_nothing_bad_is_heard(world: World) -> None:
-    bus = world.bus(AGENT)
+    bus = world.bus(ENV_SERVER)
     with pytest.raises(ValueError, match="log is lossless: only realtime is attended"):
         bus.attend(LOG, ENV, lambda received: None)
     if isinstance(world, MemoryWorld):
@@ -108,7 +111,7 @@ def test_only_what_cannot_wait_is_attended_and_nothing_bad_is_heard(world: World
 
 
 def test_queue_keeps_the_order(world: World) -> None:
-    sender, receiver = world.bus(ENV_SERVER), world.bus(LEARNER)
+    sender, receiver = world.bus(ENV_SERVER), world.bus(AGENT)
     reader = receiver.queue(LOG, ENV)
     publisher = sender.publisher(LOG, ENV)
     for seq in range(300):
@@ -118,7 +121,7 @@ def test_queue_keeps_the_order(world: World) -> None:
 
 
 def test_a_full_queue_drops_the_oldest_and_counts(world: World) -> None:
-    sender, receiver = world.bus(ENV_SERVER), world.bus(LEARNER)
+    sender, receiver = world.bus(ENV_SERVER), world.bus(AGENT)
     small, counter = receiver.queue(LOG, ENV, capacity=10), receiver.queue(LOG, ENV)
     publisher = sender.publisher(LOG, ENV)
     for seq in range(25):
@@ -132,7 +135,7 @@ def test_a_late_reader_gets_all_of_a_lossless_channel(world: World) -> None:
     publisher = world.bus(ENV_SERVER).publisher(LOG, ENV)
     for seq in range(100):
         publisher.put(batch(seq))
-    reader = world.bus(RECORDER).queue(LOG, "*")
+    reader = world.bus(AGENT).queue(LOG, "*")
     for seq in range(100, 200):
         publisher.put(batch(seq))
     assert collect(reader, until=199) == list(range(200))
@@ -154,14 +157,14 @@ def test_lossless_history_is_the_newest_2000(world: World) -> None:
     publisher = world.bus(ENV_SERVER).publisher(LOG, ENV)
     for seq in range(2100):
         publisher.put(batch(seq))
-    reader = world.bus(RECORDER).queue(LOG, ENV)
+    reader = world.bus(AGENT).queue(LOG, ENV)
     assert collect(reader, until=2099) == list(range(100, 2100))
 
 
 def test_latest_of_a_lossless_channel_starts_with_what_comes(world: World) -> None:
     sender = world.bus(ENV_SERVER).publisher(LOG, ENV)
     sender.put(batch(1))
-    receiver = world.bus(LEARNER)
+    receiver = world.bus(AGENT)
     latest, counter = receiver.latest(LOG, ENV), receiver.queue(LOG, ENV)
     collect(counter, until=1)
     assert latest.take() is None
@@ -172,16 +175,12 @@ def test_the_last_of_a_retained_channel_is_there_whoever_starts_first(
     world: World, reader_first: bool
 ) -> None:
     if reader_first:
-        agent, learner = world.bus(AGENT), None
-        latest = agent.latest(POLICY)
-        learner = world.bus(LEARNER)
-    else:
-        learner = world.bus(LEARNER)
-    publisher = learner.publisher(POLICY)
+        latest = world.bus(ENV_SERVER).latest(POLICY)
+    publisher = world.bus(AGENT).publisher(POLICY)
     for version in (1, 2, 3):
         publisher.put(policy(version, bytes(300_000)))
     if not reader_first:
-        latest = world.bus(AGENT).latest(POLICY)
+        latest = world.bus(ENV_SERVER).latest(POLICY)
 
     def newest_is(version: int) -> bool:
         received = latest.wait(0.05)
@@ -193,10 +192,10 @@ def test_the_last_of_a_retained_channel_is_there_whoever_starts_first(
 
 
 def test_a_late_queue_of_a_retained_channel_starts_with_the_last(world: World) -> None:
-    publisher = world.bus(LEARNER).publisher(POLICY)
+    publisher = world.bus(ENV_SERVER).publisher(POLICY)
     for version in (1, 2, 3):
         publisher.put(policy(version))
-    reader = world.bus(RECORDER).queue(POLICY)
+    reader = world.bus(AGENT).queue(POLICY)
     assert reader.wait(5.0)
     publisher.put(policy(4))
     versions: list[int] = []
@@ -210,18 +209,18 @@ def test_a_late_queue_of_a_retained_channel_starts_with_the_last(world: World) -
 
 
 def test_retained_data_end_with_the_bus_that_published_them(world: World) -> None:
-    keeper, learner = world.bus(ENV_SERVER), world.bus(LEARNER)
-    learner.publisher(POLICY).put(policy(1))
-    learner.close()
+    keeper, other = world.bus(ENV_SERVER), world.bus(AGENT)
+    other.publisher(POLICY).put(policy(1))
+    other.close()
     keeper.publisher(LOG, ENV).put(batch(5))
-    late = world.bus(RECORDER)
+    late = world.bus(LEARNER)
     policies, batches = late.latest(POLICY), late.queue(LOG, ENV)
     assert collect(batches, until=5) == [5]
     assert policies.take() is None
 
 
 def test_a_wildcard_hears_every_name_and_a_name_only_its_own(world: World) -> None:
-    env, agent, receiver = world.bus(ENV_SERVER), world.bus(AGENT), world.bus(RECORDER)
+    env, agent, receiver = world.bus(ENV_SERVER), world.bus(AGENT), world.bus(LEARNER)
     everyone, one = receiver.queue(STATS, "*"), receiver.queue(STATS, AGENT)
     publishers = [bus.publisher(STATS, name) for bus, name in ((env, ENV_SERVER), (agent, AGENT))]
     heard: set[str] = set()
@@ -238,8 +237,8 @@ def test_a_wildcard_hears_every_name_and_a_name_only_its_own(world: World) -> No
 
 
 def test_what_was_put_before_closing_arrives(world: World) -> None:
-    reader = world.bus(RECORDER).queue(LOG, ENV)
-    sender = world.bus(ENV_SERVER)
+    reader = world.bus(ENV_SERVER).queue(LOG, ENV)
+    sender = world.bus(AGENT)
     publisher = sender.publisher(LOG, ENV)
     publisher.put(batch(0))
     collect(reader, until=0)

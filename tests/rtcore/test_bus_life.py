@@ -36,32 +36,32 @@ def test_a_command_gets_its_reply(world: World) -> None:
 
 
 def test_a_repeated_command_repeats_the_reply_not_the_deed(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
+    env, client = world.bus(ENV_SERVER), world.bus(AGENT)
     deeds: list[str] = []
 
     def handler(command: Command) -> CommandReply:
         deeds.append(command.id)
         return CommandReply(id="", ok=True, text=f"deed {len(deeds)}")
 
-    learner.serve(LEARNER, handler)
-    first, again = client.ask(LEARNER, HOLD), client.ask(LEARNER, HOLD)
+    env.serve(ENV_SERVER, handler)
+    first, again = client.ask(ENV_SERVER, HOLD), client.ask(ENV_SERVER, HOLD)
     assert first == again == CommandReply(id="c1", ok=True, text="deed 1")
-    assert client.ask(LEARNER, Command(id="c2", verb="hold")).text == "deed 2"
+    assert client.ask(ENV_SERVER, Command(id="c2", verb="hold")).text == "deed 2"
     assert deeds == ["c1", "c2"]
 
 
 def test_a_handler_that_raises_answers_so(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
+    env, client = world.bus(ENV_SERVER), world.bus(AGENT)
 
     def handler(command: Command) -> CommandReply:
         raise RuntimeError("no window yet")
 
-    learner.serve(LEARNER, handler)
-    assert client.ask(LEARNER, HOLD) == CommandReply(id="c1", ok=False, text="RuntimeError: no window yet")
+    env.serve(ENV_SERVER, handler)
+    assert client.ask(ENV_SERVER, HOLD) == CommandReply(id="c1", ok=False, text="RuntimeError: no window yet")
 
 
 def test_nobody_answers(world: World) -> None:
-    client = world.bus("client")
+    client = world.bus(ENV_SERVER)
     begin = time.monotonic()
     with pytest.raises(NoAnswerError, match=r"learner did not answer 'hold': 2 tries of up to 0\.2 s"):
         client.ask(LEARNER, HOLD, timeout_s=0.2, tries=2)
@@ -69,10 +69,10 @@ def test_nobody_answers(world: World) -> None:
 
 
 def test_commands_to_one_process_do_not_reach_another(world: World) -> None:
-    learner, client = world.bus(LEARNER), world.bus("client")
-    learner.serve(LEARNER, lambda command: CommandReply(id=command.id, ok=True, text=""))
+    env, client = world.bus(ENV_SERVER), world.bus(AGENT)
+    env.serve(ENV_SERVER, lambda command: CommandReply(id=command.id, ok=True, text=""))
     with pytest.raises(NoAnswerError):
-        client.ask(AGENT, HOLD, timeout_s=0.1, tries=1)
+        client.ask(LEARNER, HOLD, timeout_s=0.1, tries=1)
 
 
 def test_everybody_sees_who_is_alive(world: World) -> None:

@@ -38,14 +38,14 @@ def test_random_bytes_are_counted_and_the_loop_goes_on(world: World) -> None:
 
 
 def test_a_damaged_message_is_rejected_though_it_decodes(world: World) -> None:
-    agent = world.bus(AGENT)
-    queue = agent.queue(STEP, ENV)
+    reader = world.bus(ENV_SERVER)
+    queue = reader.queue(STEP, ENV)
     first, second = (seal(msgspec.msgpack.encode(step(seq))) for seq in (1, 2))
     assert len(first) == len(second)
     world.inject(channels.STEP.key_for(ENV), first[:100] + second[100:])
     assert queue.wait(5.0)
     assert queue.drain() == []
-    assert agent.rejected() == {"step": 1}
+    assert reader.rejected() == {"step": 1}
 
 
 def test_a_bad_message_does_not_end_a_wait(world: World) -> None:
@@ -65,16 +65,16 @@ def test_a_bad_message_does_not_end_a_wait(world: World) -> None:
 
 
 def test_a_message_of_another_type_is_rejected(world: World) -> None:
-    agent = world.bus(AGENT)
-    queue = agent.queue(STEP, ENV)
+    reader = world.bus(ENV_SERVER)
+    queue = reader.queue(STEP, ENV)
     world.inject(channels.STEP.key_for(ENV), seal(msgspec.msgpack.encode(action())))
     assert queue.wait(5.0)
     assert queue.drain() == []
-    assert agent.rejected() == {"step": 1}
+    assert reader.rejected() == {"step": 1}
 
 
 def test_an_oversized_message_is_refused_by_the_sender(world: World) -> None:
-    publisher = world.bus(AGENT).publisher(ACTION, ENV)
+    publisher = world.bus(ENV_SERVER).publisher(ACTION, ENV)
     with pytest.raises(
         ValueError, match=r"channel action: a message of 400\d\d bytes: at most 30000 allowed"
     ):
@@ -135,15 +135,15 @@ def test_a_message_in_another_ones_name_is_rejected(world: World, name: str) -> 
 
 
 def test_a_step_of_another_env_is_rejected(world: World) -> None:
-    agent = world.bus(AGENT)
-    queue = agent.queue(LOG, ENV)
+    reader = world.bus(ENV_SERVER)
+    queue = reader.queue(LOG, ENV)
     world.inject(LOG.key_for(ENV), seal(msgspec.msgpack.encode(batch(0, env="env1"))))
     assert queue.wait(5.0)
     assert queue.drain() == []
-    assert agent.rejected() == {"log": 1}
+    assert reader.rejected() == {"log": 1}
 
 
 def test_a_reader_may_refuse_what_is_valid_by_itself(world: World) -> None:
-    agent = world.bus(AGENT)
-    agent.reject(STEP, "of the future")
-    assert agent.rejected() == {"step": 1}
+    reader = world.bus(ENV_SERVER)
+    reader.reject(STEP, "of the future")
+    assert reader.rejected() == {"step": 1}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -158,10 +158,14 @@ def tampered_file(scene: Scene) -> int:
     return 0
 
 
-ROGUES = (
-    no_certificate, another_authority, recorder_publishes, recorder_acts, recorder_orders, unsigned,
-    other_weights, same_hash_claimed, another_run, replayed, replayed_to_a_new_agent, tampered_file,
+# At one run each, so that one waits while the other does.
+INTRUDERS = (
+    no_certificate, another_authority, recorder_publishes, recorder_acts, recorder_orders, another_run,
 )  # fmt: skip
+FORGERS = (
+    unsigned, other_weights, same_hash_claimed, replayed, replayed_to_a_new_agent, tampered_file,
+)  # fmt: skip
+ROGUES = (*INTRUDERS, *FORGERS)
 
 
 @dataclass
@@ -190,8 +194,11 @@ def watch(scene: Scene, rogue: Callable[[Scene], int]) -> Traces:
     return Traces(returned, counted, told, {s.policy_version for s in steps}, scene.version(), len(steps) > 5)
 
 
-def play(home: Path) -> dict[str, Traces]:
-    """Let all rogues loose on one run, one after the other; its keys go to `home`, all else beside it."""
+def play(home: Path, rogues: Sequence[Callable[[Scene], int]]) -> dict[str, Traces]:
+    """Let rogues loose on one run, one after the other; its keys go to `home`, all else beside it.
+
+    Before them nobody is, under that name.
+    """
     keys.make(home, now=datetime.now(UTC))
     config = RunConfig(
         duration_s=0.0,
@@ -221,7 +228,7 @@ def play(home: Path) -> dict[str, Traces]:
                 scene.policies.put(scene.policy(version))
                 assert scene.comes(partial(lambda wanted: scene.version() == wanted, version))
             found = {"nobody": watch(scene, lambda scene: 0)}
-            for rogue in ROGUES:
+            for rogue in rogues:
                 found[rogue.__name__] = watch(scene, rogue)
                 children.append(scene.agent)
             return found

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +21,16 @@ from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.run_dir import RunDir
 from tests.system.test_processes import SMALL, finish, running, summary_of, wait_for_ticks
 
-DURATION_S, HZ = 12, 50
+DURATION_S, HZ = 14, 50
 VICTIMS = (AGENT, ENV_SERVER, RECORDER, LEARNER)  # the learner last: it takes seconds to come back, and only
 # an env server that lives has what it missed
+pytestmark = pytest.mark.timeout(120)
 QUICK = ("--supervise.first-s", "0.1", "--supervise.stuck-s", "2")
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A run in which each process was killed once, and then the agent stopped for longer than `stuck_s`."""
+    """A run and how it ended."""
 
     path: Path
     output: str
@@ -48,9 +51,8 @@ def pid_of(run: Path, process: str, limit_s: float = 10.0) -> int:
     raise AssertionError(f"no {process}")
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    run = tmp_path_factory.mktemp("killed") / "run"
+def kill_each(run: Path) -> Finished:
+    """A run in which each process is killed once, and then the agent stopped for longer than `stuck_s`."""
     settings = (*SMALL, *QUICK, "--duration-s", str(DURATION_S), "--run-dir", str(run))
     with running("run", "pointmass", *settings) as process:
         wait_for_ticks(run, process)
@@ -61,6 +63,42 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         os.kill(pid_of(run, AGENT), signal.SIGSTOP)
         output = finish(process, 60)
     return Finished(run, output, process.returncode, summary_of(run))
+
+
+def kill_twice(run: Path) -> Finished:
+    """A run whose agent dies more often than allowed."""
+    settings = (*SMALL, "--supervise.limit", "1", "--duration-s", "60", "--run-dir", str(run))
+    with running("run", "pointmass", *settings, "--no-record") as process:
+        wait_for_ticks(run, process)
+        first = pid_of(run, AGENT)
+        os.kill(first, signal.SIGKILL)
+        while (second := pid_of(run, AGENT)) == first:
+            time.sleep(0.02)
+        os.kill(second, signal.SIGKILL)
+        output = finish(process, 30)
+    return Finished(run, output, process.returncode, summary_of(run))
+
+
+def play(home: Path) -> tuple[Finished, Finished]:
+    with ThreadPoolExecutor(2) as pool:
+        each, twice = pool.submit(kill_each, home / "each"), pool.submit(kill_twice, home / "twice")
+        return each.result(), twice.result()
+
+
+@pytest.fixture(scope="module")
+def both(played: Callable[[str], Any]) -> tuple[Finished, Finished]:
+    found: tuple[Finished, Finished] = played("test_killed")
+    return found
+
+
+@pytest.fixture
+def finished(both: tuple[Finished, Finished]) -> Finished:
+    return both[0]
+
+
+@pytest.fixture
+def given_up(both: tuple[Finished, Finished]) -> Finished:
+    return both[1]
 
 
 def test_the_run_goes_on_to_its_end(finished: Finished) -> None:
@@ -115,22 +153,12 @@ def test_every_life_of_a_process_left_its_counters(finished: Finished) -> None:
     }
 
 
-def test_a_process_that_dies_more_often_than_allowed_ends_the_run_loudly(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    settings = (*SMALL, "--supervise.limit", "1", "--duration-s", "60", "--run-dir", str(run))
-    with running("run", "pointmass", *settings, "--no-record") as process:
-        wait_for_ticks(run, process)
-        first = pid_of(run, AGENT)
-        os.kill(first, signal.SIGKILL)
-        while (second := pid_of(run, AGENT)) == first:
-            time.sleep(0.02)
-        os.kill(second, signal.SIGKILL)
-        output = finish(process, 30)
-    assert process.returncode == 1
+def test_a_process_that_dies_more_often_than_allowed_ends_the_run_loudly(given_up: Finished) -> None:
+    assert given_up.code == 1
     gave_up = "agent_service died 2 times in a row (2 x signal SIGKILL)"
-    assert f"{gave_up}: the run ends" in output
-    assert f"tenuto: {gave_up}; its last lines:" in output
-    summary = summary_of(run)
+    assert f"{gave_up}: the run ends" in given_up.output
+    assert f"tenuto: {gave_up}; its last lines:" in given_up.output
+    summary = given_up.summary
     assert summary["ended"] == gave_up
     assert summary["forced"] == []
     assert [one["what"] for one in summary["supervision"]] == ["died", "restarted", "died", "gave_up"]

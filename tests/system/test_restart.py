@@ -11,7 +11,8 @@ from itertools import pairwise
 import pytest
 
 from env_server.worlds.registry import resolve
-from launcher.summary import add_up, discrepancies, summarise
+from launcher.summary import discrepancies, summarise
+from launcher.totals import add_up
 from learner import resume
 from learner.replay import open_replay
 from recorder.reading import columns

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from rtcore import channels
-from tests.system.rogues import ROGUES, Traces, play, tampered_file
+from tests.system import rogues
+from tests.system.rogues import FORGERS, INTRUDERS, ROGUES, Traces, tampered_file
 
+pytestmark = pytest.mark.timeout(120)
 ENV_DENIED, AGENT_DENIED = (f"{process}.link.denied" for process in (channels.ENV_SERVER, channels.AGENT))
 REJECTED, RECEIVED, FOREIGN = (
     f"{channels.AGENT}.policies.{what}" for what in ("rejected", "received", "foreign")
 )
 
 
+def play(home: Path) -> dict[str, Traces]:
+    with ThreadPoolExecutor(2) as pool:
+        runs = [
+            pool.submit(rogues.play, home / name / "keys", who)
+            for name, who in (("intruders", INTRUDERS), ("forgers", FORGERS))
+        ]
+        return runs[0].result() | runs[1].result()
+
+
 @pytest.fixture(scope="module")
-def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Traces]:
-    return play(tmp_path_factory.mktemp("rogues") / "keys")
+def traces(played: Callable[[str], Any]) -> dict[str, Traces]:
+    found: dict[str, Traces] = played("test_rogues")
+    return found
 
 
 def test_the_honest_ones_are_refused_nothing(traces: dict[str, Traces]) -> None:

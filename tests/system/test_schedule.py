@@ -6,6 +6,8 @@ import json
 import re
 import subprocess
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +19,7 @@ from experiments.follow_runs import explained
 from recorder.reading import columns, texts
 from tests.launcher.commands import command_line, tenuto
 
+pytestmark = pytest.mark.timeout(120)
 AUTO = (
     "chain", "--env.hz", "100", "--env.unit-s", "0.1", "--env.episode-steps", "9",
     "--learner.forecast.l-p", "4",
@@ -28,7 +31,7 @@ WRONG = ("fixed", "--l-f", "0")
 
 @dataclass
 class Changed:
-    """A run of 7 s, 70 units, that was asked for a wrong schedule and then for a right one."""
+    """A run that was asked for a wrong schedule and for a right one, and ended some windows later."""
 
     path: Path
     wrong: subprocess.CompletedProcess[str]
@@ -45,25 +48,33 @@ class Changed:
         return next(int(one["m"]) for one in self.windows if one["G"] + one["N"] != 8)
 
 
-@pytest.fixture(scope="module")
-def changed(tmp_path_factory: pytest.TempPathFactory) -> Changed:
-    root = tmp_path_factory.mktemp("schedule")
+def play(root: Path) -> Changed:
     run, log = root / "run", root / "run" / "logs" / "learner.jsonl"
-    arguments = command_line("run", *AUTO, "--duration-s", "7", "--run-dir", str(run), "--record")
+    arguments = command_line("run", *AUTO, "--duration-s", "60", "--run-dir", str(run), "--record")
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             deadline = time.monotonic() + 40
             while not (log.exists() and "window 0: " in log.read_text()):
                 assert process.poll() is None and time.monotonic() < deadline, "the first window is entered"
                 time.sleep(0.05)
-            wrong, right = (
-                tenuto("schedule", *wanted, "--run-dir", str(run), cwd=root) for wanted in (WRONG, FIXED)
-            )
+            with ThreadPoolExecutor(2) as pool:  # a busy machine takes seconds to start each
+                wrong, right = pool.map(
+                    lambda wanted: tenuto("schedule", *wanted, "--run-dir", str(run), cwd=root),
+                    (WRONG, FIXED),
+                )
+            time.sleep(2.0)  # 20 units: what is left of a window of 8, and windows of 4
+            assert tenuto("stop", "--run-dir", str(run), cwd=root).returncode == 0
             output, _ = process.communicate(timeout=40)
         finally:
             process.terminate()  # nothing, if it has ended
     assert process.returncode == 0, output
     return Changed(run, wrong, right, json.loads((run / "summary.json").read_text())["windows"])
+
+
+@pytest.fixture(scope="module")
+def changed(played: Callable[[str], Any]) -> Changed:
+    found: Changed = played("test_schedule")
+    return found
 
 
 def test_a_wrong_schedule_is_refused_in_one_line(changed: Changed) -> None:

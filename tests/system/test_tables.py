@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -16,6 +17,7 @@ from launcher.summary import discrepancies
 from recorder.reading import columns, document, spans
 from tests.launcher.commands import command_line
 
+pytestmark = pytest.mark.timeout(120)
 UNIT_NS = 250_000_000
 HOLDS = ("--learner.schedule.l-f", "4", "--learner.schedule.gamma-f", "0.5")  # 2 units, and 2
 
@@ -33,10 +35,9 @@ def sim(run: Path, preset: str, *arguments: str, duration_s: float) -> dict[str,
     return {name: value for name, value in summary.items() if name not in ("run", "wall_s")}
 
 
-@pytest.fixture(scope="module")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def play(home: Path) -> Path:
     """Eight seconds of cliffworld with all four processes: 8 windows of 1 s, half of each a hold."""
-    run = tmp_path_factory.mktemp("tables") / "run"
+    run = home / "run"
     done = subprocess.run(
         command_line(
             "run", "cliffworld", "--learner.algo", "fq", "--env.unit-s", "0.25", *HOLDS,
@@ -46,6 +47,12 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return run
+
+
+@pytest.fixture(scope="module")
+def real(played: Callable[[str], Any]) -> Path:
+    found: Path = played("test_tables")
+    return found
 
 
 def test_a_real_run_reconciles(real: Path) -> None:

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks.two_hosts import SPLIT, Summary, config, play
+from benchmarks import two_hosts as hosts_run
+from benchmarks.two_hosts import SPLIT, Summary, config
 from launcher.chaos.netlab import missing, two_hosts
 from launcher.summary import discrepancies
 from rtcore import channels
 from rtcore.run_dir import RunDir
 
-pytestmark = pytest.mark.skipif(missing() != "", reason=f"two network namespaces: {missing()}")
+pytestmark = [
+    pytest.mark.skipif(missing() != "", reason=f"two network namespaces: {missing()}"),
+    pytest.mark.timeout(120),
+]
 
 HZ, DURATION_S, BEFORE_S, CUT_S = 100.0, 5.5, 1.0, 2.0
 
@@ -38,9 +44,7 @@ def counted(home: Path) -> Counter[str]:
     return found
 
 
-@pytest.fixture(scope="module")
-def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
-    home = tmp_path_factory.mktemp("hosts")
+def play(home: Path) -> Story:
     seen: list[Counter[str]] = []
     with two_hosts() as hosts:
 
@@ -52,8 +56,14 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
             seen.append(counted(home))
             hosts.restore()
 
-        summary = play(hosts, home, config(home, hz=HZ, duration_s=DURATION_S), during=during)
+        summary = hosts_run.play(hosts, home, config(home, hz=HZ, duration_s=DURATION_S), during=during)
     return Story(seen[0], seen[1], summary)
+
+
+@pytest.fixture(scope="module")
+def story(played: Callable[[str], Any]) -> Story:
+    found: Story = played("test_two_hosts")
+    return found
 
 
 def test_what_was_lost_is_counted_exactly(story: Story) -> None:
