@@ -26,8 +26,9 @@ from benchmarks.outcome import Outcome, share_above
 from env_server.worlds.registry import resolve
 from launcher import presets
 from launcher.stealing import StealMeter
-from launcher.summary import Summary, add_up, discrepancies, summarise
+from launcher.summary import Summary, discrepancies, summarise
 from launcher.supervisor import Interrupts, Supervisor, command_for
+from launcher.totals import add_up
 from rtcore import channels
 from rtcore.config import RunConfig
 from rtcore.config_check import check

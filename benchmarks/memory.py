@@ -11,7 +11,10 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ import tyro
 from benchmarks.harness import run_system, world, write_result
 from benchmarks.outcome import cell
 from rtcore import channels
+from rtcore.cast import Part
 from rtcore.realtime import Rt
 
 PACKAGES = ("eclipse-zenoh", "rerun-sdk", "torch", "numpy", "mujoco")
@@ -52,8 +56,18 @@ class Sample:
 
 @dataclass
 class Sampler:
-    """Looks at this process's children every five seconds."""
+    """Looks now and then at the children of a process.
 
+    Attributes:
+        parent: theirs.
+        called: the parent's own name; empty: it is not sampled.
+        every_s: how often.
+        samples: by name of the process.
+    """
+
+    parent: psutil.Process = field(default_factory=psutil.Process)
+    called: str = ""
+    every_s: float = SAMPLE_S
     due_s: float = 0.0
     samples: dict[str, list[Sample]] = field(default_factory=dict)
 
@@ -62,20 +76,29 @@ class Sampler:
         now_s = time.monotonic()
         if now_s < self.due_s:
             return
-        self.due_s = now_s + SAMPLE_S
-        for child in psutil.Process().children():
-            try:
-                name, memory = role(child.cmdline()), child.memory_info()
-            except psutil.Error:  # it has ended
-                continue
-            if name is not None:
-                sample = Sample(now_s, memory.rss - memory.shared, memory.rss)
-                self.samples.setdefault(name, []).append(sample)
+        self.due_s = now_s + self.every_s
+        with suppress(psutil.Error):  # it has ended
+            if self.called:
+                self._take(self.called, self.parent, now_s)
+            for child in self.parent.children():
+                with suppress(psutil.Error):
+                    self._take(process(child.cmdline()), child, now_s)
+
+    def _take(self, name: str | None, seen: psutil.Process, now_s: float) -> None:
+        memory = seen.memory_info()
+        if name is not None and memory.rss:  # without any it is about to be gone
+            sample = Sample(now_s, memory.rss - memory.shared, memory.rss)
+            self.samples.setdefault(name, []).append(sample)
 
 
-def role(command: list[str]) -> str | None:
-    """Which of the four processes a command line starts."""
-    return next((name for name in channels.PROCESSES if name in command), None)
+def process(command: Sequence[str]) -> str | None:
+    """Which process of a run a command line starts, by name."""
+    words = dict(pairwise(command))
+    role = words.get("-m")
+    if role not in channels.PROCESSES:
+        return None
+    index = words.get("--index")
+    return Part(role, None if index is None else int(index)).name
 
 
 def growth(samples: list[Sample], warm_up_s: float = WARM_UP_S, span_s: float = SPAN_S) -> dict[str, Any]:

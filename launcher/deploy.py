@@ -17,8 +17,10 @@ from launcher.cli import DONE
 from launcher.parsing import HELP_FLAGS, given
 from launcher.supervisor import ENDING_LIMIT_S
 from launcher.vitals import START_NS
+from rtcore import cast
+from rtcore.cast import PER_ENV, Part
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
-from rtcore.config import ConfigError, SuperviseConfig
+from rtcore.config import ConfigError, RunConfig, SuperviseConfig
 
 IMAGE = "tenuto:latest"
 RUNS = PurePosixPath("/runs")  # in the container: on a volume, owned by the image's user
@@ -29,7 +31,7 @@ PORT = 7447
 SUBCOMMANDS = {ENV_SERVER: "env", AGENT: "agent", LEARNER: "learn", RECORDER: "record"}
 DEFAULT_RUN = ("halfcheetah", "--duration-s", "0")
 OURS = ("--run-dir", "--connect", "--listen", "--router", "--config", "--link.connect", "--link.listen",
-        "--link.secure")  # fmt: skip
+        "--link.secure", "--index")  # fmt: skip
 CHECK_S = 30  # a check costs a third of a second of a core: four of them 4 % of one
 CHECK_LIMIT_S = 5  # beyond what it waits for a turn
 UNLIMITED = -1
@@ -42,7 +44,7 @@ class Service:
     """One container.
 
     Attributes:
-        name: of the process, or `ROUTER`.
+        name: of the process, with a hyphen before its number, or `ROUTER`.
         command: what it runs.
         check: what says by its exit code whether it is well.
         check_limit_s: how long that may take.
@@ -62,29 +64,15 @@ class Service:
     after: tuple[str, ...] = ()
 
 
-def services(run: Sequence[str] = DEFAULT_RUN) -> tuple[Service, ...]:
+def services(run: Sequence[str] = DEFAULT_RUN, config: RunConfig | None = None) -> tuple[Service, ...]:
     """The containers of a run.
 
     Args:
         run: what says which run it is: a preset and what differs from it. Every process gets it: whoever
             comes first makes the directory.
+        config: what that makes; None: with one environment.
     """
-    supervise = SuperviseConfig()
-    place = ("--run-dir", str(RUN), "--connect", f"tcp/{ROUTER}:{PORT}")
-    limit_s = round(supervise.stuck_s) + CHECK_LIMIT_S
-    found = [
-        Service(
-            name=process,
-            command=("tenuto", SUBCOMMANDS[process], *run, *place),
-            check=("tenuto", "health", process, "--run-dir", str(RUN), "--kill-stuck"),
-            check_limit_s=limit_s,
-            start_s=START_NS // 1_000_000_000,
-            # Real-time priorities and locked memory, for who has a deadline.
-            ulimits={"rtprio": 99, "memlock": UNLIMITED} if process in (ENV_SERVER, AGENT) else {},
-            after=later[:1] or (ROUTER,),
-        )
-        for process, later in ((process, PROCESSES[i + 1 :]) for i, process in enumerate(PROCESSES))
-    ]
+    found = [_service(part, run) for part in cast.parts(config or RunConfig())]
     connects = f"import socket; socket.create_connection(('127.0.0.1', {PORT}), 2)"
     router = Service(
         name=ROUTER,
@@ -93,6 +81,29 @@ def services(run: Sequence[str] = DEFAULT_RUN) -> tuple[Service, ...]:
         ports=(PORT,),
     )
     return (router, *found)
+
+
+def _service(part: Part, run: Sequence[str]) -> Service:
+    place = ("--run-dir", str(RUN), "--connect", f"tcp/{ROUTER}:{PORT}")
+    index = () if part.index is None else ("--index", str(part.index))
+    later = PROCESSES[PROCESSES.index(part.role) + 1 :]
+    # An environment's agent has its number; all others are one.
+    after = Part(later[0], part.index if later[0] in PER_ENV else None) if later else None
+    return Service(
+        name=_service_name(part),
+        command=("tenuto", SUBCOMMANDS[part.role], *run, *place, *index),
+        check=("tenuto", "health", part.name, "--run-dir", str(RUN), "--kill-stuck"),
+        check_limit_s=round(SuperviseConfig().stuck_s) + CHECK_LIMIT_S,
+        start_s=START_NS // 1_000_000_000,
+        # Real-time priorities and locked memory, for who has a deadline.
+        ulimits={"rtprio": 99, "memlock": UNLIMITED} if part.role in PER_ENV else {},
+        after=(ROUTER if after is None else _service_name(after),),
+    )
+
+
+def _service_name(part: Part) -> str:
+    """A service is also a host's name, in which a dot would part it."""
+    return part.name.replace(".", "-")
 
 
 def as_compose(found: Sequence[Service]) -> dict[str, Node]:
@@ -155,9 +166,9 @@ def compose(argv: Sequence[str]) -> int:
     argv = list(argv) or list(DEFAULT_RUN)
     if not given("--duration-s", argv) and not any(flag in argv for flag in HELP_FLAGS):
         argv += ["--duration-s", "0"]
-    options.read(options.RunOptions, argv, prog="tenuto compose", description=description)
+    config, _ = options.read(options.RunOptions, argv, prog="tenuto compose", description=description)
     command = " ".join(["tenuto compose", *argv]) if argv != list(DEFAULT_RUN) else "tenuto compose"
-    sys.stdout.write(render(services(argv), command))
+    sys.stdout.write(render(services(argv, config), command))
     return DONE
 
 

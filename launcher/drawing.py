@@ -58,15 +58,17 @@ def pairs(rows: Sequence[tuple[str, Text | str]]) -> Table:
     return table
 
 
-def latencies(rows: Mapping[str, Mapping[str, float | None]]) -> Table:
-    """One row per quantity, in microseconds: p50, p99, p99.9, max."""
+def latencies(
+    rows: Mapping[str, Mapping[str, float | None]], names: Sequence[str] = ("p50", "p99", "p999", "max")
+) -> Table:
+    """One row per quantity, in microseconds; a column for each of the `names`."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style=LABEL, no_wrap=True)
-    for _ in range(4):
+    for _ in names:
         table.add_column(justify="right", no_wrap=True)
-    table.add_row("µs", *(Text(name, style=LABEL) for name in ("p50", "p99", "p99.9", "max")))
+    table.add_row("µs", *(Text("p99.9" if name == "p999" else name, style=LABEL) for name in names))
     for label, row in rows.items():
-        table.add_row(label, *(microseconds(row[name]) for name in ("p50", "p99", "p999", "max")))
+        table.add_row(label, *(microseconds(row[name]) for name in names))
     return table
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 
 from launcher.herald import Herald
 from launcher.restarts import Happening
@@ -12,8 +13,18 @@ from launcher.vitals import Vitals
 from launcher.watch import Watch
 from rtcore import channels
 from rtcore.bus import Bus, QueueReader
+from rtcore.cast import role_of
 from rtcore.clock import Clock
 from rtcore.messages import Stats
+
+
+def by_role(processes: Collection[str]) -> list[str]:
+    """Processes in connect order, for people: those of a fleet are counted, as `3 env_server`."""
+    found = []
+    for role in channels.PROCESSES:
+        names = [name for name in processes if role_of(name) == role]
+        found += names if len(names) < 2 else [f"{len(names)} {role}"]
+    return found
 
 
 class Lookout:
@@ -55,6 +66,5 @@ class Lookout:
             self._viewer.open()
             self._screen.say(f"view {self._viewer.address}")
         if waiting_for:
-            names = [name for name in channels.PROCESSES if name in waiting_for]
-            self._screen.note = "ending: " + ", ".join(names)
+            self._screen.note = "ending: " + ", ".join(by_role(waiting_for))
         self._screen.update()

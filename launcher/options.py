@@ -70,6 +70,8 @@ class ProcessOptions(RunOptions):
     """A further endpoint to listen on; may be given several times."""
     router: str = ""
     """The Zenoh router, like tcp/host:7447, to reach the others through, and nothing else."""
+    index: int | None = None
+    """Of a fleet's environment, from 0: which env server or agent."""
 
 
 SHORT = {"--learner.schedule": "--learner.schedule.kind"}  # what a section is mostly asked for by

@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from launcher import options
 from launcher.starting import process_command
-from rtcore import channels
+from rtcore import cast, channels
 from rtcore.config import ConfigError, RunConfig
 from rtcore.run_dir import RunDir
 
@@ -41,7 +41,7 @@ def record(argv: Sequence[str]) -> int:
     _become(channels.RECORDER, "record", "The recorder alone.", argv)
 
 
-def _become(process: str, command: str, does: str, argv: Sequence[str]) -> NoReturn:
+def _become(role: str, command: str, does: str, argv: Sequence[str]) -> NoReturn:
     """Replace this process by the one that was asked for, so that signals reach it directly."""
     description = options.describe(f"{does} An existing run directory already says which run it is.")
     config, chosen = options.read(
@@ -49,10 +49,11 @@ def _become(process: str, command: str, does: str, argv: Sequence[str]) -> NoRet
     )
     if chosen.run_dir is None:
         raise ConfigError("run_dir", None, "must be given: the directory that the run's processes share")
-    options.require_keys(config.link, [process], (*chosen.connect, *chosen.listen))
+    part = cast.part_for(config, role, chosen.index)
+    options.require_keys(config.link, [role], (*chosen.connect, *chosen.listen))
     run_dir = _join(chosen.run_dir, config)
     arguments = process_command(
-        process, run_dir.path, connect=chosen.connect, listen=chosen.listen, router=chosen.router
+        part.name, run_dir.path, connect=chosen.connect, listen=chosen.listen, router=chosen.router
     )
     sys.stdout.flush()
     os.execv(sys.executable, arguments)

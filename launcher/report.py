@@ -69,6 +69,7 @@ def render(summary: Summary, run_dir: RunDir) -> RenderableType:
     body = Group(
         _real_time(summary),
         Text(),
+        *([_envs(summary["envs"]), Text()] if "envs" in summary else []),
         _learning(summary),
         Text(),
         _accounts(summary),
@@ -92,7 +93,7 @@ def _real_time(summary: Summary) -> RenderableType:
     deadlines = summary["deadlines"]
     causes = drawing.causes(deadlines["missed_by_cause"])
     rows: list[tuple[str, Text | str]] = [
-        ("ticks", f"{summary['ticks']:,} at {drawing.number(summary['tick_hz'], 1)} Hz"),
+        ("ticks", f"{summary['ticks']:,} at {_each(summary)}{drawing.number(summary['tick_hz'], 1)} Hz"),
         ("missed", drawing.misses(deadlines["missed"], deadlines["miss_ratio"])),
         *([("", causes)] if causes else []),
         ("overruns", f"{deadlines['overruns']:,}"),
@@ -107,14 +108,45 @@ def _real_time(summary: Summary) -> RenderableType:
     return _side_by_side(drawing.pairs(rows), times)
 
 
+def _each(summary: Summary) -> str:
+    """Of a fleet, how many times what follows."""
+    count = summary.get("env_count", 1)
+    return "" if count == 1 else f"{count} x "
+
+
+def _envs(rows: Summary) -> RenderableType:
+    """What each environment of a fleet did."""
+    table = Table.grid(padding=(0, 1))
+    table.add_column(style=LABEL, no_wrap=True)
+    heads = ("ticks", "missed", "episodes", "return", "learned", "lost", "adopted", "↻")
+    for _ in heads:
+        table.add_column(justify="right", no_wrap=True)
+    table.add_row("", *(Text(head, style=LABEL) for head in heads))
+    for name, row in rows.items():
+        table.add_row(
+            name,
+            f"{row['ticks']:,}",
+            drawing.misses(row["missed"], row["miss_ratio"]),
+            f"{row['episodes']:,}",
+            drawing.number(row["mean_return"], 2),
+            f"{row['learned']:,}",
+            f"{row['lost']:,}",
+            f"{row['adopted']:,}",
+            str(sum(row["restarts"].values())),
+        )
+    return table
+
+
 def _learning(summary: Summary) -> RenderableType:
     returns, policies, learner = summary["returns"], summary["policies"], summary["learner"]
     first, last = returns[:EDGE], returns[-EDGE:]
     rows: list[tuple[str, Text | str]] = [
         ("episodes", f"{summary['episodes']:,}, mean return {drawing.number(summary['mean_return'], 2)}"),
-        ("return", Text(drawing.sparkline(returns, WIDTH - 30), style=ACCENT)),
     ]
-    if len(returns) >= 2 * EDGE:
+    one_after_the_other = "envs" not in summary  # a fleet's are environment by environment: no course of time
+    if one_after_the_other:
+        rows.append(("return", Text(drawing.sparkline(returns, WIDTH - 30), style=ACCENT)))
+    if one_after_the_other and len(returns) >= 2 * EDGE:
         rows.append(("", f"first {EDGE}: {fmean(first):,.2f}   last {EDGE}: {fmean(last):,.2f}"))
     windows = summary["windows"]
     shape = ", ".join(sorted({f"G {one['G']} N {one['N']}" for one in windows[:-1] or windows}))

@@ -19,13 +19,14 @@ from launcher.lookout import Lookout
 from launcher.mending import mend
 from launcher.restarts import Happening, Restarts
 from launcher.screen import Screen
-from launcher.summary import PASSED, Summary, summarise
+from launcher.summary import Summary, passed, summarise
 from launcher.supervisor import End, Interrupts, Supervisor, command_for
 from launcher.viewer import Viewer
 from launcher.vitals import Vitals
 from launcher.watch import Watch
-from rtcore import channels, epoch, realtime
+from rtcore import cast, channels, epoch, realtime
 from rtcore.bus import BusError
+from rtcore.cast import role_of
 from rtcore.config import ConfigError, RunConfig
 from rtcore.files import write_atomic
 from rtcore.monotonic import MonotonicClock
@@ -41,7 +42,7 @@ def run(argv: Sequence[str]) -> int:
     """`tenuto run [PRESET] ...`."""
     description = options.describe("Learn in real time, with all processes on this machine.")
     config, chosen = options.read(options.RunOptions, argv, prog="tenuto run", description=description)
-    options.require_keys(config.link, (*_wanted(config), OPERATOR))
+    options.require_keys(config.link, (*dict.fromkeys(map(role_of, _wanted(config))), OPERATOR))
     run_dir = RunDir.create(chosen.run_dir or default_path(config), config)
     clock, console = MonotonicClock(), Console()
     console.print(f"run  {run_dir.path}", highlight=False, soft_wrap=True)
@@ -96,9 +97,9 @@ def _keep(summary: Summary, run_dir: RunDir) -> bool:
     return True
 
 
-def _wanted(config: RunConfig) -> list[str]:
+def _wanted(config: RunConfig) -> tuple[str, ...]:
     """The run's processes."""
-    return [name for name in channels.PROCESSES if name != channels.RECORDER or config.recorder.record]
+    return cast.names(config, record=config.recorder.record)
 
 
 def _carry_out(
@@ -122,7 +123,12 @@ def _carry_out(
                 realtime.out_of_the_way(config.agent.rt),
                 logged(run_dir.log_path(channels.LAUNCHER)),
                 open_bus(
-                    "client", run_dir.run_name, run_dir.socket_dir(), clock=clock, secure=config.link.secure
+                    "client",
+                    run_dir.run_name,
+                    run_dir.socket_dir(),
+                    clock=clock,
+                    peers=cast.names(config),
+                    secure=config.link.secure,
                 ) as bus,
                 closing(viewer),
                 screen.shown(),
@@ -155,9 +161,9 @@ def _why(end: End, config: RunConfig, watch: Watch) -> str:
         return "; ".join(str(failure) for failure in end.failures)
     if end.reason == "interrupted":
         return "interrupted"
-    env = watch.totals(channels.ENV_SERVER).counters
-    whole = config.duration_s * (config.env.hz or 1.0)
-    reached = config.duration_s > 0 and sum(env[name] for name in PASSED) >= int(whole)
+    whole = int(config.duration_s * (config.env.hz or 1.0))
+    servers = cast.of_role(config, channels.ENV_SERVER)
+    reached = config.duration_s > 0 and all(passed(watch.totals(name)) >= whole for name in servers)
     return "duration" if reached else "stopped"
 
 

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from rtcore.cast import index_of, role_of
+
 
 def process_command(
     process: str,
@@ -20,7 +22,7 @@ def process_command(
     """The command line of one process.
 
     Args:
-        process: one of `channels.PROCESSES`.
+        process: its name, of a fleet like `env_server.2` (`rtcore.cast`).
         run: the run's directory.
         connect: further endpoints to connect to.
         listen: further endpoints to listen on.
@@ -28,7 +30,9 @@ def process_command(
         supervisor: number of the process with which it ends.
         python: the interpreter.
     """
-    found = [python, "-m", process, "--run", str(run)]
+    found = [python, "-m", role_of(process), "--run", str(run)]
+    index = index_of(process)
+    found += [] if index is None else ["--index", str(index)]
     for name, endpoints in (("--connect", connect), ("--listen", listen)):
         for endpoint in endpoints:
             found += [name, endpoint]

@@ -2,52 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any, Literal
 
+from launcher import fleet
+from launcher.fates import FATES, fates
+from launcher.totals import Totals, add_up, together
+from rtcore import cast
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.config import RunConfig
-from rtcore.histogram import Histogram
 from rtcore.messages import CAUSES, Stats, WindowNotice
 
 SCHEMA = 1
-FATES = ("adopted", "rejected", "superseded", "unused", "unreceived")  # of a published policy
 REJECTED = "messages.rejected."  # begins the counters of each channel
 PASSED = ("ticks", "skipped", "down")  # every deadline from T0 on is one of them
 
 Summary = dict[str, Any]
 StatsByProcess = Mapping[str, Sequence[Stats]]  # per process: the newest ledger of each incarnation
-
-
-@dataclass
-class Totals:
-    """One process's ledgers, added up over its incarnations."""
-
-    counters: Counter[str] = field(default_factory=Counter)
-    gauges: dict[str, float] = field(default_factory=dict)  # of the newest incarnation that has them
-    histograms: dict[str, Histogram] = field(default_factory=dict)
-    returns: list[float] = field(default_factory=list)  # in the order of the episodes
-    windows: list[WindowNotice] = field(default_factory=list)
-
-    def quantiles(self, name: str, scale: float) -> dict[str, float | None]:
-        """{p50, p99, p999, max} of a histogram in ns, times `scale`; None where nothing was recorded."""
-        return self.histograms.get(name, Histogram()).summary(scale)
-
-
-def add_up(incarnations: Sequence[Stats]) -> Totals:
-    """One process's totals."""
-    total = Totals()
-    for ledger in sorted(incarnations, key=lambda one: one.incarnation):
-        total.counters.update(ledger.counters)
-        total.gauges.update(ledger.gauges)
-        total.windows.extend(ledger.windows)
-        total.returns.extend(one.value for one in sorted(ledger.returns, key=lambda one: one.episode))
-        for name, data in ledger.histograms.items():
-            total.histograms.setdefault(name, Histogram()).merge(Histogram.from_bytes(data))
-    return total
 
 
 def summarise(
@@ -66,23 +40,27 @@ def summarise(
     Args:
         config: the run's, resolved (`env.hz` is known).
         run: the run's name.
-        stats: every process's ledgers; a process may be absent.
+        stats: every process's ledgers; a process may be absent, and who is none of the run's is left out.
         wall_s: seconds from the start of the first process to the end of the last.
         restarts: how often each process was started again.
         ended: why the run ended, in a few words.
         forced: processes that had to be killed at the end.
         clock: what the run went by.
     """
-    totals = {process: add_up(stats.get(process, ())) for process in PROCESSES}
+    processes = {name: add_up(stats.get(name, ())) for name in cast.names(config)}
+    of_role = {role: cast.of_role(config, role) for role in PROCESSES}
+    totals = {role: together(processes[name] for name in names) for role, names in of_role.items()}
     env, learner, recorder = totals[ENV_SERVER], totals[LEARNER], totals[RECORDER]
-    ticks = env.counters["ticks"]
-    return {
+    run_time_s = max(passed(processes[name]) for name in of_role[ENV_SERVER]) / (config.env.hz or math.inf)
+    published = learner.counters["published"]
+    became = {name: fates(published, stats.get(name, ())) for name in of_role[AGENT]}
+    found = {
         **_about(config, run),
         "wall_s": wall_s,
         "clock": clock,
         "ended": ended,
         "forced": list(forced),
-        "ticks": ticks,
+        "ticks": env.counters["ticks"],
         "resets": env.counters["resets"],
         "episodes": env.counters["episodes"],
         "mean_return": fmean(env.returns) if env.returns else None,
@@ -91,17 +69,21 @@ def summarise(
         "pacing_error_us": env.quantiles("pacing", 1e-3),
         "reaction_us": totals[AGENT].quantiles("reaction", 1e-3),
         "loop_us": env.quantiles("loop", 1e-3),
-        "policies": _policies(learner, totals[AGENT], stats),
+        "policies": _policies(learner, totals[AGENT], stats.get(LEARNER, ()), list(became.values())),
         "windows": _windows(learner.windows),
         "operator_holds": learner.counters["operator_holds"],
         "transitions": _transitions(env, learner),
-        "learner": _learner(learner, _run_time_s(env, config)),
+        "learner": _learner(learner, run_time_s),
         "forecast": _forecast(learner.gauges),
         "recorder": {"rows": recorder.counters["rows"], "dropped": recorder.counters["dropped"]},
-        "restarts": {process: restarts.get(process, 0) for process in PROCESSES},
+        "restarts": {role: sum(restarts.get(name, 0) for name in of_role[role]) for role in PROCESSES},
         "supervision": [],
         "messages": _messages(totals.values()),
     }
+    if config.env.count == 1:
+        return found
+    found["transitions"]["unread"] = learner.counters["unread"]
+    return found | {"envs": fleet.rows(config, processes, became, restarts)}
 
 
 def _messages(totals: Collection[Totals]) -> Summary:
@@ -126,6 +108,7 @@ def _about(config: RunConfig, run: str) -> Summary:
         "run": run,
         "preset": config.preset,
         "env": config.env.id,
+        "env_count": config.env.count,
         "algo": config.learner.algo,
         "seed": config.seed,
         "tick_hz": config.env.hz,
@@ -135,15 +118,16 @@ def _about(config: RunConfig, run: str) -> Summary:
 
 def discrepancies(summary: Summary) -> list[str]:
     """What does not reconcile, each as an equation that fails; empty when everything does."""
-    transitions, policies = summary["transitions"], summary["policies"]
-    fates = sum(policies[name] for name in FATES)
+    transitions, policies, agents = summary["transitions"], summary["policies"], summary.get("env_count", 1)
     pairs = [
         ("ticks = produced + resets", summary["ticks"], transitions["produced"] + summary["resets"]),
         ("produced = learned + lost", transitions["produced"], transitions["learned"] + transitions["lost"]),
         (
-            "published + received_again = " + " + ".join(FATES),
-            policies["published"] + policies["received_again"],
-            fates,
+            ("published" if agents == 1 else f"published x {agents}")
+            + " + received_again = "
+            + " + ".join(FATES),
+            agents * policies["published"] + policies["received_again"],
+            sum(policies[name] for name in FATES),
         ),
         (
             "missed = sum of its causes",
@@ -153,7 +137,8 @@ def discrepancies(summary: Summary) -> list[str]:
     ]
     failing = [f"{equation}: {left} != {right}" for equation, left, right in pairs if left != right]
     left_over = {"transitions.lost": transitions["lost"], "policies.unreceived": policies["unreceived"]}
-    return failing + [f"{name} >= 0: it is {count}" for name, count in left_over.items() if count < 0]
+    failing += [f"{name} >= 0: it is {count}" for name, count in left_over.items() if count < 0]
+    return failing + fleet.discrepancies(summary)
 
 
 def _deadlines(env: Totals) -> Summary:
@@ -170,54 +155,22 @@ def _deadlines(env: Totals) -> Summary:
     }
 
 
-def _policies(learner: Totals, agent: Totals, stats: StatsByProcess) -> Summary:
-    """Every published policy has one of the `FATES`. `unused`: ready when the agent ended, or died;
-    `unreceived`: no agent lived to get it. The last one of a run often has one of these two.
-
-    What the agent got once more has a fate once more, `received_again` of them: the newest one after it was
-    started again, and older ones, which it rejects. `foreign` ones were not the learner's, and have none.
+def _policies(
+    learner: Totals, agent: Totals, learners: Sequence[Stats], became: Sequence[Mapping[str, int]]
+) -> Summary:
+    """Every published policy has one of the `FATES` with each agent: `became` (`launcher.fates`). `foreign`
+    ones were not the learner's, and have none. `learners` are the lives of the learner.
     """
-    published, received = learner.counters["published"], agent.counters["policies.received"]
-    again = _received_again(stats.get(AGENT, ()))
     latency = agent.quantiles("publish_to_adopt", 1e-6)
     return {
-        "published": published,
-        "adopted": agent.counters["policies.adopted"],
-        "rejected": agent.counters["policies.rejected"],
-        "superseded": agent.counters["policies.superseded"],
-        "unused": agent.counters["policies.unused"] + _died_with_a_policy(stats.get(AGENT, ())),
-        "unreceived": published - (received - again),
-        "received_again": again,
+        "published": learner.counters["published"],
+        **{name: sum(one[name] for one in became) for name in (*FATES, "received_again")},
         "foreign": agent.counters["policies.foreign"],
         "published_in_hold": learner.counters["published_in_hold"],
         "withheld": learner.counters["withheld"],
-        "last_version": max(
-            (life.counters.get("last_version", 0) for life in stats.get(LEARNER, ())), default=0
-        ),
+        "last_version": max((life.counters.get("last_version", 0) for life in learners), default=0),
         "publish_to_adopt_ms": {name: latency[name] for name in ("p50", "p99", "max")},
     }
-
-
-def _died_with_a_policy(lives: Iterable[Stats]) -> int:
-    """Policies received by a life of the agent that was killed before it could say what became of them."""
-    killed = [Counter(life.counters) for life in lives if not life.final]
-    known = ("adopted", "rejected", "superseded", "unused")
-    return sum(
-        max(0, counters["policies.received"] - sum(counters[f"policies.{fate}"] for fate in known))
-        for counters in killed
-    )
-
-
-def _received_again(lives: Iterable[Stats]) -> int:
-    """Policies that were there before: older than the newest, or what a life of the agent began with and an
-    earlier one had.
-    """
-    newest = again = 0
-    for life in sorted(lives, key=lambda one: one.incarnation):
-        first = life.counters.get("policies.first", 0)
-        again += (0 < first <= newest) + life.counters.get("policies.past", 0)
-        newest = max(newest, life.counters.get("policies.newest", 0))
-    return again
 
 
 def _windows(notices: Iterable[WindowNotice]) -> list[Summary]:
@@ -259,9 +212,9 @@ def _governor(learner: Totals) -> Summary:
     }
 
 
-def _run_time_s(env: Totals, config: RunConfig) -> float:
-    """Seconds of run time that were ticked through, skipped, or without an env server."""
-    return sum(env.counters[name] for name in PASSED) / config.env.hz if config.env.hz else 0.0
+def passed(env: Totals) -> int:
+    """Deadlines that one environment ticked through, skipped, or was without an env server at."""
+    return sum(env.counters[name] for name in PASSED)
 
 
 def _forecast(gauges: Mapping[str, float]) -> Summary:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from types import FrameType
 from typing import Literal
@@ -18,6 +19,7 @@ from launcher.restarts import Again, GiveUp, Happening, Restarts, What, describe
 from launcher.starting import process_command
 from launcher.vitals import Vitals
 from rtcore import channels
+from rtcore.cast import role_of
 
 Reason = Literal["duration", "interrupted", "failed", "killed"]
 
@@ -26,8 +28,8 @@ INTERRUPTED_LIMIT_S = 4.5  # from Ctrl-C to the last kill; the summary fits into
 ENDING_LIMIT_S = 20.0  # when nobody is waiting: the recorder may take 10 s to compact a long recording
 NOT_STARTED = 126  # exit code of a life that the system refused, as shells have it
 
-# The world ends first, then who depends on what it sent. A process gets its SIGTERM when all before
-# it have ended, or when this share of the time is over.
+# The world ends first, then who depends on what it sent. A role's processes get their SIGTERM when those
+# of all roles before it have ended, or when this share of the time is over.
 LATEST_SHARE = {channels.ENV_SERVER: 0.0, channels.AGENT: 0.2, channels.LEARNER: 0.3, channels.RECORDER: 0.7}
 
 
@@ -109,18 +111,17 @@ class OrderlyEnd:
             return [(process, signal.SIGKILL) for process in self._order if process in running]
         found: list[tuple[str, signal.Signals]] = []
         earlier_ended = True
-        for process in self._order:
-            latest_s = LATEST_SHARE.get(process, 0.0) * self.limit_s
-            its_turn = earlier_ended or elapsed_s >= latest_s
-            if its_turn and process in running and process not in self._asked:
-                self._asked.add(process)
-                found.append((process, signal.SIGTERM))
-            earlier_ended = earlier_ended and process not in running
+        for role, processes in groupby(self._order, role_of):
+            going_on = [process for process in processes if process in running]
+            if earlier_ended or elapsed_s >= LATEST_SHARE.get(role, 0.0) * self.limit_s:
+                found += [(process, signal.SIGTERM) for process in going_on if process not in self._asked]
+            earlier_ended = earlier_ended and not going_on
+        self._asked.update(process for process, _ in found)
         return found
 
 
 class Supervisor:
-    """Child processes by name; the first of them is the one whose orderly end ends the run."""
+    """Child processes by name, in connect order; the orderly end of all of the first role ends the run."""
 
     def __init__(
         self,
@@ -145,6 +146,8 @@ class Supervisor:
         self._dead: set[str] = set()  # whose death has been entered
         self._due_ns: dict[str, int] = {}  # of the dead: when their next life begins
         self._hung: set[str] = set()  # killed for that, and not seen to end yet
+        self._leaders = {name for name in commands if role_of(name) == role_of(next(iter(commands)))}
+        self._done: set[str] = set()  # of the leaders: who has ended in order
 
     @contextmanager
     def started(self) -> Iterator[None]:
@@ -163,8 +166,8 @@ class Supervisor:
         return self._children.exits().get(process) == 0
 
     def supervise(self, interrupts: Interrupts, on_poll: Callable[[frozenset[str]], None]) -> End:
-        """Start again who dies, until the run's end, and carry that out: the first process ends by itself,
-        one is given up, or somebody interrupts (twice: kill at once).
+        """Start again who dies, until the run's end, and carry that out: all leaders have ended by
+        themselves, one process is given up, or somebody interrupts (twice: kill at once).
 
         Args:
             interrupts: counts them.
@@ -192,11 +195,11 @@ class Supervisor:
 
     def _wait(self, interrupts: Interrupts, on_poll: Callable[[frozenset[str]], None]) -> End:
         """Until there is a reason to end."""
-        leader = self._children.names[0]
         while not interrupts.count:
             exits = {name: n for name, n in self._children.exits().items() if name not in self._dead}
-            over = exits.get(leader) == 0
-            bad = {name: n for name, n in exits.items() if not (over and n == 0)}
+            self._note_done(exits)
+            over = self._done == self._leaders
+            bad = {name: n for name, n in exits.items() if n != 0 or not (over or name in self._done)}
             failures = [failure for name, n in bad.items() if (failure := self._died(name, n))]
             if over:
                 return End("duration", failures)
@@ -207,6 +210,14 @@ class Supervisor:
             on_poll(frozenset())
             time.sleep(POLL_S)
         return End("interrupted")
+
+    def _note_done(self, exits: Mapping[str, int]) -> None:
+        """An environment that ended in order before the others is through; nothing more is expected of it."""
+        for process in self._leaders - self._done:
+            if exits.get(process) == 0:
+                self._done.add(process)
+                if self._vitals is not None:
+                    self._vitals.gone(process)
 
     def _died(self, process: str, code: int, error: OSError | None = None) -> Failure | None:
         """Enter a death, or that a life could not begin; a failure if it is the last one."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rtcore import channels
+from rtcore.cast import role_of
 from rtcore.messages import Stats
 
 START_NS = 60_000_000_000  # from a start to the first turn: learning's libraries, a busy machine
 # The launcher looks 20 times a second. A longer pause between two looks was its own: it was stopped, or the
 # machine was, and so may have been the others.
 LONGEST_LOOK_NS = 500_000_000
-# Four processes speak four times a second each. Hearing nobody for so long, the launcher is the deaf one.
+# All processes speak four times a second each. Hearing nobody for so long, the launcher is the deaf one.
 DEAF_NS = 1_000_000_000
 
 
@@ -55,7 +56,7 @@ class Vitals:
 
     def heard(self, stats: Stats, received_ns: int) -> None:
         """Take in a message, of whatever process and life."""
-        if stats.process not in channels.PROCESSES:
+        if role_of(stats.process) not in channels.PROCESSES:
             return
         self._heard_ns = received_ns
         self._newest[stats.process] = max(stats.incarnation, self._newest.get(stats.process, -1))

@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 import msgspec
 
 from launcher.restarts import Happening
-from launcher.summary import StatsByProcess, Totals, add_up
+from launcher.summary import StatsByProcess
+from launcher.totals import Totals, add_up, together
 from rtcore import channels
+from rtcore.cast import index_of, role_of
 from rtcore.health import Health, health
 from rtcore.messages import EpisodeReturn, Event, Stats, WindowNotice
 from rtcore.tally import raised
@@ -119,12 +121,25 @@ class Watch:
             found.setdefault(process, []).append(life.whole())
         return found
 
-    def totals(self, process: str) -> Totals:
-        """One process's ledgers added up; empty before its first message."""
-        return add_up([life.whole() for (name, _), life in self._lives.items() if name == process])
+    def totals(self, name: str) -> Totals:
+        """The ledgers of a process, or of all processes of a role, added up; empty before a first message."""
+        lives: dict[str, list[Stats]] = {}
+        for (process, _), life in self._lives.items():
+            if name in (process, role_of(process)):
+                lives.setdefault(process, []).append(life.whole())
+        in_order = sorted(lives, key=lambda process: index_of(process) or 0)
+        return together(add_up(lives[process]) for process in in_order)
 
-    def rate(self, process: str, counter: str) -> float | None:
-        """A counter's rise per second over the last two seconds; None before two messages came."""
+    def rate(self, name: str, counter: str) -> float | None:
+        """A counter's rise per second over the last two seconds, of a process or of all of a role that have
+        one; None before two messages came. Of a role, who has ended counts no more while others go on.
+        """
+        processes = [process for process in self._recent if name in (process, role_of(process))]
+        going_on = [process for process in processes if not self.ended(process)] or processes
+        rates = [rate for process in going_on if (rate := self._rate(process, counter)) is not None]
+        return sum(rates) if rates else None
+
+    def _rate(self, process: str, counter: str) -> float | None:
         recent = self._recent.get(process)
         if recent is None or len(recent) < 2:
             return None

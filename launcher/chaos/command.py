@@ -17,16 +17,17 @@ from pathlib import Path
 from rich.console import Console
 
 from launcher import options
+from launcher.chaos.clause import passed
 from launcher.chaos.evidence import gather
 from launcher.chaos.faults import Done, Execution, Lives, Victims
-from launcher.chaos.judge import judge, passed
+from launcher.chaos.judge import judge
 from launcher.chaos.plan import Fault, Kind, parse_kinds, plan
 from launcher.chaos.report import as_json, render
 from launcher.cli import DONE, FAILED, INTERRUPTED, CommandError
 from launcher.parsing import HELP_FLAGS, given, value_after
 from launcher.run import default_path
 from launcher.supervisor import Interrupts
-from rtcore import epoch
+from rtcore import cast, epoch
 from rtcore.config import ConfigError, RunConfig
 from rtcore.config_io import dump_toml
 from rtcore.files import write_atomic
@@ -102,7 +103,7 @@ def chaos(argv: Sequence[str]) -> int:
 def _planned(config: RunConfig, chosen: ChaosOptions) -> tuple[tuple[Kind, ...], tuple[Fault, ...]]:
     """What shall befall the run."""
     kinds = parse_kinds(chosen.kinds)
-    faults = plan(config.seed, chosen.kills, config.duration_s, kinds)
+    faults = plan(config.seed, chosen.kills, config.duration_s, kinds, cast.names(config))
     if "partition" in kinds:
         if not chosen.interface or not (INTERFACES / chosen.interface).exists():
             names = ", ".join(sorted(path.name for path in INTERFACES.iterdir()))

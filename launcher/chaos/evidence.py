@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,15 @@ from launcher.chaos.faults import Done
 from launcher.report import load
 from launcher.summary import Summary
 from learner import marks
-from rtcore import channels
+from rtcore.cast import PER_ENV, Part, env_names, of_role, role_of
+from rtcore.channels import AGENT, LEARNER, RECORDER
 from rtcore.config import ConfigError
 from rtcore.run_dir import RunDir
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
+SHARED = ("published", "last_version")  # counters of the learner that are of every environment
 REFUSED = re.compile(r"policy (\d+) refused")
 
 
@@ -63,10 +65,12 @@ class Evidence:
         tick_s: the control period.
         num_ticks: deadlines in the run's duration; None: it has none.
         summary: summary.json; None: there is none.
-        lives: of each process, oldest first.
-        recorded: the recording.
+        lives: of each process, by name, oldest first.
+        recorded: the recording; of a fleet what its environments share.
         refused: versions that the agent refused.
         kept: transitions that the learner's replay says were ever added to it; None: nobody can tell.
+        env: whose evidence it is; empty: that of the run.
+        fleet: of each environment; empty: there is one, and this is its.
     """
 
     done: Sequence[Done]
@@ -78,10 +82,54 @@ class Evidence:
     recorded: Recorded
     refused: frozenset[int] = frozenset()
     kept: int | None = None
+    env: str = ""
+    fleet: tuple[Evidence, ...] = ()
 
-    def total(self, process: str, counter: str) -> int:
-        """A counter, over all lives of a process."""
-        return sum(life.counters.get(counter, 0) for life in self.lives.get(process, ()))
+    def of_role(self, role: str) -> list[Life]:
+        """All lives of the processes of a role."""
+        return [life for name, lives in self.lives.items() if role_of(name) == role for life in lives]
+
+    def total(self, role: str, counter: str) -> int:
+        """A counter, over all lives of the processes of a role."""
+        return sum(life.counters.get(counter, 0) for life in self.of_role(role))
+
+    def of(self, index: int, env: str, recorded: Recorded, refused: frozenset[int] = frozenset()) -> Evidence:
+        """An environment's own, as if it had the run for itself: its env server and its agent are called by
+        their roles, other environments' by their names. The replay is everybody's.
+
+        Args:
+            index: of the environment.
+            env: its name.
+            recorded: the recording of it.
+            refused: versions that its agent refused.
+        """
+        own = {Part(role, index).name: role for role in PER_ENV}
+        lives = {role: self.lives.get(name, ()) for name, role in own.items()}
+        done = [
+            replace(one, fault=replace(one.fault, process=own.get(one.fault.process, one.fault.process)))
+            for one in self.done
+        ]
+        return replace(
+            self,
+            done=done,
+            lives=lives
+            | {
+                LEARNER: [_own(life, env) for life in self.lives.get(LEARNER, ())],
+                RECORDER: self.lives.get(RECORDER, ()),
+            },
+            recorded=recorded,
+            refused=refused,
+            kept=None,
+            env=env,
+        )
+
+
+def _own(life: Life, env: str) -> Life:
+    """The learner's life with an environment's counters in place of the totals that there are of it."""
+    ending = f".{env}"
+    own = {name.removesuffix(ending): count for name, count in life.counters.items() if name.endswith(ending)}
+    shared = {name: life.counters[name] for name in SHARED if name in life.counters}
+    return Life(shared | own, life.ended)
 
 
 def gather(run_dir: RunDir, done: Sequence[Done], *, ended: bool) -> Evidence:
@@ -93,33 +141,46 @@ def gather(run_dir: RunDir, done: Sequence[Done], *, ended: bool) -> Evidence:
     config = run_dir.config()
     assert config.env.hz is not None, "a run's configuration is resolved"
     # The recording first: while a run goes on, its counters are then ahead of the rows.
-    recorded = read_recording(run_dir.recording_path)
+    envs = env_names(config.env)
+    prefixes = [f"/{env}" for env in envs] if len(envs) > 1 else [""]
+    recorded = [read_recording(run_dir.recording_path, prefix) for prefix in prefixes]
     lives: dict[str, list[Life]] = {}
     for stats in run_dir.read_final_stats():
         lives.setdefault(stats.process, []).append(Life(stats.counters, stats.final))
     summary = None
     with suppress(ConfigError):
         summary = load(run_dir)
-    return Evidence(
+    told = [refused(run_dir.log_path(agent)) for agent in of_role(config, AGENT)]
+    whole = Evidence(
         done=done,
         ended=ended,
         tick_s=1 / config.env.hz,
         num_ticks=round(config.duration_s * config.env.hz) if config.duration_s else None,
         summary=summary,
         lives=lives,
-        recorded=recorded,
-        refused=refused(run_dir.log_path(channels.AGENT)),
+        recorded=recorded[0],
+        refused=told[0],
         kept=_kept(run_dir.learner_dir / "replay" / "marks.bin"),
+    )
+    if len(envs) == 1:
+        return whole
+    rows = zip(envs, recorded, told, strict=True)
+    shared = Recorded(published=recorded[0].published, problem=recorded[0].problem)
+    return replace(
+        whole,
+        recorded=shared,
+        refused=frozenset(),
+        fleet=tuple(whole.of(index, *row) for index, row in enumerate(rows)),
     )
 
 
-def read_recording(path: Path) -> Recorded:
-    """Read it as far as it goes."""
+def read_recording(path: Path, prefix: str = "") -> Recorded:
+    """Read it as far as it goes; `prefix` is before the names of what is an environment's own."""
     from recorder import reading  # loads the recording's library
 
     try:
-        ticks, pacing = reading.columns(path, "/env/pacing_us")
-        _, acted = reading.columns(path, "/agent/policy_version")
+        ticks, pacing = reading.columns(path, f"{prefix}/env/pacing_us")
+        _, acted = reading.columns(path, f"{prefix}/agent/policy_version")
         _, published = reading.columns(path, "/learner/published_version", timeline="run_time")
     except (RuntimeError, OSError, ValueError) as error:
         return Recorded(problem=" ".join(str(error).split()) or type(error).__name__)

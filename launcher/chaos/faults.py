@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from launcher.chaos.plan import LINK, Deed, Fault
+from rtcore.cast import index_of, role_of
 from rtcore.clock import Clock
 
 PROC = Path("/proc")
@@ -130,7 +131,9 @@ class Interface:
 
 
 class Lives:
-    """The processes of one run on this machine: `python -m <process> ... --run <run>`."""
+    """The processes of one run on this machine: `python -m <role> --run <run>`, with `--index <i>` if the
+    process's name has a number.
+    """
 
     def __init__(self, run: Path) -> None:
         self._run = str(run)
@@ -157,7 +160,10 @@ class Lives:
         except OSError:
             return False
         pairs = set(pairwise(words))
-        return ("-m", process) in pairs and ("--run", self._run) in pairs
+        wanted = {("-m", role_of(process)), ("--run", self._run)}
+        if (index := index_of(process)) is not None:
+            wanted.add(("--index", str(index)))
+        return wanted <= pairs
 
 
 class Victims:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import signal
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from launcher.chaos.clause import Clause, together
 from launcher.chaos.evidence import Evidence
 from launcher.chaos.layout import lay_out, masks
 from launcher.summary import discrepancies
+from rtcore.cast import role_of
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 
 # The pacing error beside others' faults may be twice what it is in quiet; a tenth of a period is no matter.
@@ -24,34 +25,27 @@ LOST_SHARE, STALL_S = 1e-3, 0.1
 LEAST_QUIET = 500  # ticks, for a p99 to compare with
 
 
-@dataclass(frozen=True)
-class Clause:
-    """One promise.
-
-    Attributes:
-        name: which.
-        holds: whether it was kept; None: it cannot be judged.
-        text: why, for people.
-        numbers: what it was judged by.
-    """
-
-    name: str
-    holds: bool | None
-    text: str
-    numbers: dict[str, Any] = field(default_factory=dict)
-
-
 def judge(evidence: Evidence) -> list[Clause]:
-    """All clauses."""
+    """All clauses; of a fleet, what is an environment's own is judged of each."""
+    of_run = (carried_out, deaths, report)
     clauses: Sequence[Callable[[Evidence], Clause]] = (
         carried_out, pacing, overruns, transitions, versions, policies, deadlines, deaths, report, recording
     )  # fmt: skip
-    return [clause(evidence) for clause in clauses]
+    return [
+        _of_each(clause, evidence) if evidence.fleet and clause not in of_run else clause(evidence)
+        for clause in clauses
+    ]
 
 
-def passed(clauses: Sequence[Clause]) -> bool:
-    """Whether none failed."""
-    return all(clause.holds is not False for clause in clauses)
+def _of_each(clause: Callable[[Evidence], Clause], evidence: Evidence) -> Clause:
+    """A clause of every environment; what is lost and missing in all, too."""
+    each = {one.env: clause(one) for one in evidence.fleet}
+    whole = None
+    if clause is transitions:
+        whole = transitions(evidence)
+    elif clause is recording:
+        whole = _dropped(evidence, list(each.values()))
+    return together(each, whole)
 
 
 def carried_out(evidence: Evidence) -> Clause:
@@ -111,7 +105,7 @@ def transitions(evidence: Evidence) -> Clause:
     produced = evidence.total(ENV_SERVER, "produced")
     learned = evidence.total(LEARNER, "learned") - evidence.total(LEARNER, "unread")
     gaps, lost = evidence.total(LEARNER, "gaps"), produced - learned
-    died = sum(not life.ended for life in evidence.lives.get(ENV_SERVER, ()))  # or still lives
+    died = sum(not life.ended for life in evidence.of_role(ENV_SERVER))  # or still lives
     uncertain = evidence.total(LEARNER, "unread") or evidence.total(LEARNER, "replay.unbacked")
     kept = None if uncertain else evidence.kept
     problems = []
@@ -190,7 +184,7 @@ def deaths(evidence: Evidence) -> Clause:
     )
     died = Counter(one["process"] for one in told if one["what"] in ("died", "stuck"))
     again = evidence.summary["restarts"]
-    others = {name: died[name] - ours[name] for name in PROCESSES if died[name] != ours[name]}
+    others = {name: died[name] - ours[name] for name in (ours | died) if died[name] != ours[name]}
     odd = [
         f"{one['process']} {one['what']} at {one['at_s']:.1f} s (code {one['code']})"
         for one in told
@@ -199,7 +193,8 @@ def deaths(evidence: Evidence) -> Clause:
     text = f"{ours.total()} by our hand, {died.total()} in all, {sum(again.values())} restarts"
     if others:
         text += "; " + ", ".join(f"{name} {n:+d}" for name, n in others.items())
-    holds = not others and not odd and all(again.get(name, 0) == ours[name] for name in PROCESSES)
+    killed = Counter(role_of(name) for name in ours.elements())  # the summary counts restarts by role
+    holds = not others and not odd and all(again.get(role, 0) == killed[role] for role in PROCESSES)
     return Clause("deaths", holds, "; ".join([text, *odd]), {"ours": dict(ours), "died": dict(died)})
 
 
@@ -241,3 +236,13 @@ def recording(evidence: Evidence) -> Clause:
     numbers = {"rows": len(rows), "ticks": ticks, "died": died, "missing": missing, "dropped": dropped}
     holds = missing <= dropped and not twice and not stray and len(unique) > 0
     return Clause("recording", holds, text, numbers | {"twice": twice, "stray": stray})
+
+
+def _dropped(evidence: Evidence, each: Sequence[Clause]) -> Clause:
+    """The recorder's count of what it dropped is one, so it is held against what all environments lack."""
+    names = ("rows", "ticks", "died", "missing")
+    numbers = {name: sum(one.numbers.get(name, 0) for one in each) for name in names}
+    dropped = numbers["dropped"] = evidence.total(RECORDER, "dropped")
+    text = f"{numbers['rows']:,} of {numbers['ticks']:,} ticks; {numbers['died']:,} died with env servers, "
+    text += f"{numbers['missing']:,} missing, {dropped:,} counted as dropped"
+    return Clause("recording", numbers["missing"] <= dropped, text, numbers)

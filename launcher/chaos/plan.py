@@ -45,7 +45,7 @@ class Fault:
 
     Attributes:
         at_s: when, in seconds of run time.
-        process: whom it befalls.
+        process: whom it befalls, by name.
         kind: "kill": SIGKILL. "stop": SIGSTOP, then SIGCONT. "slow": both by turns, so it runs half of the
             time. "fill": no file of its can grow, as if its disk were full. "partition": the network
             interface is down.
@@ -72,7 +72,13 @@ class Fault:
         return tuple(found)
 
 
-def plan(seed: int, kills: int, duration_s: float, kinds: Sequence[Kind]) -> tuple[Fault, ...]:
+def plan(
+    seed: int,
+    kills: int,
+    duration_s: float,
+    kinds: Sequence[Kind],
+    processes: Sequence[str] = PROCESSES,
+) -> tuple[Fault, ...]:
     """Faults in order of time, each at a random instant, on a random process, for a random time.
 
     Processes and kinds are dealt like cards, so that short plans have some of each.
@@ -82,6 +88,7 @@ def plan(seed: int, kills: int, duration_s: float, kinds: Sequence[Kind]) -> tup
         kills: how many faults, of all kinds.
         duration_s: of the run.
         kinds: to choose from.
+        processes: likewise, by name.
 
     Raises:
         ConfigError: there is nothing to choose from, or no time for it.
@@ -95,11 +102,11 @@ def plan(seed: int, kills: int, duration_s: float, kinds: Sequence[Kind]) -> tup
     rng = random.Random(seed)
     first_s, last_s = min(BEGIN_S, duration_s / 4), duration_s - min(END_S, duration_s / 4)
     instants = sorted(rng.uniform(first_s, last_s) for _ in range(kills))
-    processes, chosen = _dealt(rng, PROCESSES), _dealt(rng, kinds)
+    victims, chosen = _dealt(rng, processes), _dealt(rng, kinds)
     fillable = _dealt(rng, FILLED)
     faults = []
     for at_s in instants:
-        kind, process = next(chosen), next(processes)
+        kind, process = next(chosen), next(victims)
         if kind == "fill" and process not in FILLED:
             process = next(fillable)
         process = LINK if kind == "partition" else process

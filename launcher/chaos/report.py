@@ -13,11 +13,12 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from launcher.chaos.clause import Clause, passed
 from launcher.chaos.faults import Done
-from launcher.chaos.judge import Clause, passed
 from launcher.chaos.plan import KINDS, LINK
 from launcher.drawing import LABEL, pairs
 from launcher.report import WIDTH
+from rtcore.cast import role_of
 from rtcore.channels import PROCESSES
 
 SCHEMA = 1
@@ -55,7 +56,7 @@ def render(run: str, done: Sequence[Done], clauses: Sequence[Clause], path: Path
 
 
 def _faults(done: Sequence[Done]) -> Table:
-    counted = Counter((one.fault.process, one.fault.kind) for one in done if one.at_s is not None)
+    counted = Counter((role_of(one.fault.process), one.fault.kind) for one in done if one.at_s is not None)
     kinds = [kind for kind in KINDS if any(one.fault.kind == kind for one in done)]
     table = Table.grid(padding=(0, 3))
     table.add_column(style=LABEL)

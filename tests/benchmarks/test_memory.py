@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.memory import Sample, growth, role
+from benchmarks.memory import Sample, growth, process
 
 
 def samples(own: list[int]) -> list[Sample]:
@@ -24,5 +24,6 @@ def test_a_run_that_ends_in_its_warm_up_says_nothing() -> None:
 
 
 def test_a_process_is_known_by_its_module() -> None:
-    assert role(["python", "-m", "learner", "--run", "x"]) == "learner"
-    assert role(["python", "-m", "pytest"]) is None
+    assert process(["python", "-m", "learner", "--run", "x"]) == "learner"
+    assert process(["python", "-m", "env_server", "--run", "learner", "--index", "3"]) == "env_server.3"
+    assert process(["python", "-m", "pytest"]) is None

@@ -18,6 +18,7 @@ from launcher.deploy import DEFAULT_RUN, PORT, ROUTER, RUN, USER, as_compose, co
 from launcher.health import HealthOptions
 from launcher.parsing import parse
 from launcher.router import RouterOptions
+from rtcore import cast
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.config import ConfigError, SuperviseConfig
 
@@ -127,6 +128,38 @@ def test_another_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert command[:7] == ["tenuto", "learn", "pointmass", "--env.hz", "50", "--duration-s", "0"]
 
 
+def test_a_fleet_has_a_service_for_each_environment(capsys: pytest.CaptureFixture[str]) -> None:
+    assert compose(["pointmass", "--env.count", "3"]) == 0
+    found = yaml.safe_load(capsys.readouterr().out)["services"]
+    assert list(found) == [
+        ROUTER, *(f"{role}-{i}" for role in (ENV_SERVER, AGENT) for i in range(3)), LEARNER, RECORDER,
+    ]  # fmt: skip
+    assert found["env_server-2"]["command"][-2:] == ["--index", "2"]
+    assert found["env_server-2"]["command"][:5] == ["tenuto", "env", "pointmass", "--env.count", "3"]
+    assert found["env_server-2"]["healthcheck"]["test"][1:4] == ["tenuto", "health", "env_server.2"]
+    assert "--index" not in found[LEARNER]["command"]
+    after = {name: service.get("depends_on", []) for name, service in found.items()}
+    assert after == {
+        **{f"{ENV_SERVER}-{i}": [f"{AGENT}-{i}"] for i in range(3)},
+        **{f"{AGENT}-{i}": [LEARNER] for i in range(3)},
+        LEARNER: [RECORDER], RECORDER: [ROUTER], ROUTER: [],
+    }  # fmt: skip
+    limited = {name for name, service in found.items() if "ulimits" in service}
+    assert limited == set(found) - {ROUTER, LEARNER, RECORDER}
+
+
+def test_every_command_of_a_fleet_is_one_that_tenuto_understands() -> None:
+    run = ("pointmass", "--env.count", "2", "--duration-s", "0")
+    config, _ = options.read(options.RunOptions, run, prog="", description="")
+    found = {service.name: service for service in services(run, config)}
+    for part in cast.parts(config):
+        service = found[part.name.replace(".", "-")]
+        told, chosen = options.read(options.ProcessOptions, service.command[2:], prog="", description="")
+        assert (told, chosen.index) == (config, part.index)
+        health = parse(HealthOptions, service.check[2:], prog="", description="")
+        assert health.process == part.name
+
+
 @pytest.mark.parametrize(
     ("arguments", "field"),
     [
@@ -134,6 +167,8 @@ def test_another_run(capsys: pytest.CaptureFixture[str]) -> None:
         (["nothing"], "preset"),
         (["--run-dir", "x"], "run_dir"),
         (["--link.secure=x"], "link.secure"),
+        (["--index", "1"], "index"),
+        (["pointmass", "--env.count", "17"], "env.count"),
     ],
 )
 def test_wrong_input_prints_nothing(

@@ -10,11 +10,15 @@ from pathlib import Path
 import pytest
 
 from launcher import health
+from launcher.cli import run_command
+from launcher.starting import process_command
 from rtcore.channels import LEARNER, STATS
+from rtcore.config import RunConfig
 from rtcore.memory_bus import MemoryHub
 from rtcore.monotonic import MonotonicClock
+from rtcore.run_dir import RunDir
 from tests.launcher.commands import tenuto
-from tests.launcher.ledgers import ledger
+from tests.launcher.ledgers import CONFIG, FLEET, ledger
 
 S = 1_000_000_000
 STUCK_S = 0.3
@@ -81,3 +85,38 @@ def test_wrong_input(tmp_path: Path) -> None:
     nobody = tenuto("health", "nobody", "--run-dir", "x", cwd=tmp_path)
     assert nobody.returncode == 2
     assert nobody.stderr.startswith("tenuto: process = 'nobody': one of env_server, agent_service")
+
+
+@pytest.mark.parametrize(
+    ("config", "asked", "allowed"),
+    [
+        (FLEET, "env_server", "env_server.0, env_server.1, env_server.2, agent_service.0"),
+        (FLEET, "env_server.3", "env_server.0, env_server.1, env_server.2, agent_service.0"),
+        (FLEET, "learner.0", "env_server.0, env_server.1"),
+        (CONFIG, "env_server.0", "env_server, agent_service, learner, recorder"),
+    ],
+)
+def test_a_process_is_one_of_the_runs_own(
+    config: RunConfig, asked: str, allowed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunDir.create(tmp_path / "r1", config)
+    assert run_command(["health", asked, "--run-dir", str(run.path)]) == 2
+    assert capsys.readouterr().err.startswith(f"tenuto: process = '{asked}': one of {allowed}")
+
+
+def test_only_the_process_of_that_name_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health, "START_NS", 0)
+    (tmp_path / "some_role.py").write_text("import time\nprint('up', flush=True)\ntime.sleep(60)\n")
+    commands = [process_command(f"some_role.{index}", tmp_path) for index in (0, 1)]
+    found = [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) for command in commands]
+    try:
+        for process in found:
+            assert process.stdout is not None
+            process.stdout.readline()
+        assert health.kill(tmp_path, "some_role.1")
+        assert found[1].wait(5) == -9
+        assert found[0].poll() is None
+    finally:
+        for process in found:
+            process.kill()
+            process.communicate()

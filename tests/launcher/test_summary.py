@@ -5,10 +5,11 @@ from typing import Any
 
 import pytest
 
-from launcher.summary import FATES, discrepancies, summarise
+from launcher.fates import FATES
+from launcher.summary import discrepancies, summarise
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER
-from rtcore.messages import CAUSES, Stats
-from tests.launcher.ledgers import CONFIG, agent_ledger, env_ledger, episode, ledger, whole_run
+from rtcore.messages import CAUSES
+from tests.launcher.ledgers import CONFIG, agent_ledger, agent_life, env_ledger, episode, ledger, whole_run
 
 NOBODY = dict.fromkeys(CAUSES, 0)
 
@@ -28,6 +29,7 @@ def test_the_whole_summary_of_a_small_run() -> None:
         "run": "r1",
         "preset": "pointmass",
         "env": "pointmass",
+        "env_count": 1,
         "algo": "sac",
         "seed": 4,
         "tick_hz": 100.0,
@@ -166,21 +168,17 @@ def test_counts_that_do_not_reconcile_are_named() -> None:
     ]
 
 
-def agent_life(incarnation: int, *, final: bool, first: int, newest: int, **fates: int) -> Stats:
-    counters = {f"policies.{name}": count for name, count in fates.items()}
-    counters |= {"policies.first": first, "policies.newest": newest}
-    return ledger(AGENT, incarnation=incarnation, final=final, counters=counters)
-
-
 def test_policies_reconcile_over_the_lives_of_an_agent() -> None:
     """Ten were published. The first life got 1..4, of which 4 was ready when it was killed; the second got
     4 again, and 5 and 6; nobody lived for 7; the third began with 8 and got 9, unused, and not 10, and
     somebody sent it 3 once more."""
     learner = ledger(LEARNER, counters={"published": 10, "last_version": 10})
     lives = [
-        agent_life(1, final=False, first=1, newest=4, received=4, adopted=2, superseded=1),
-        agent_life(2, final=True, first=4, newest=6, received=3, adopted=3),
-        agent_life(3, final=True, first=8, newest=9, received=3, adopted=1, unused=1, rejected=1, past=1),
+        agent_life(AGENT, 1, final=False, first=1, newest=4, received=4, adopted=2, superseded=1),
+        agent_life(AGENT, 2, final=True, first=4, newest=6, received=3, adopted=3),
+        agent_life(
+            AGENT, 3, final=True, first=8, newest=9, received=3, adopted=1, unused=1, rejected=1, past=1
+        ),
     ]
     summary = summary_of({AGENT: lives[::-1], LEARNER: [learner]})
     found = {name: summary["policies"][name] for name in (*FATES, "received_again")}
@@ -197,7 +195,7 @@ def test_policies_reconcile_over_the_lives_of_an_agent() -> None:
 
 def test_policies_of_nobody_are_apart() -> None:
     learner = ledger(LEARNER, counters={"published": 1})
-    lives = [agent_life(1, final=True, first=1, newest=1, received=1, adopted=1, foreign=2)]
+    lives = [agent_life(AGENT, 1, final=True, first=1, newest=1, received=1, adopted=1, foreign=2)]
     summary = summary_of({AGENT: lives, LEARNER: [learner]})
     assert summary["policies"]["foreign"] == 2
     assert discrepancies(summary) == []
@@ -205,7 +203,7 @@ def test_policies_of_nobody_are_apart() -> None:
 
 def test_an_agent_that_received_more_than_there_was_is_named() -> None:
     learner = ledger(LEARNER, counters={"published": 1})
-    lives = [agent_life(n, final=True, first=n, newest=n, received=1, adopted=1) for n in (1, 2)]
+    lives = [agent_life(AGENT, n, final=True, first=n, newest=n, received=1, adopted=1) for n in (1, 2)]
     assert discrepancies(summary_of({AGENT: lives, LEARNER: [learner]})) == [
         "policies.unreceived >= 0: it is -1"
     ]

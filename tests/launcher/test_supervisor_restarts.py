@@ -111,11 +111,16 @@ def test_wrong_input_is_not_tried_twice(tmp_path: Path) -> None:
 
 def test_the_env_servers_own_end_is_the_end_though_somebody_is_between_two_lives(tmp_path: Path) -> None:
     slow = SuperviseConfig(first_s=100.0, most_s=100.0)
-    behaviours = {LEARNER: ["ends", "1"], ENV_SERVER: ["ends", "0"]}
+    behaviours = {LEARNER: ["ends", "1"], ENV_SERVER: ["leaves"]}
+
+    def look(interrupts: Interrupts, told: list[Happening]) -> None:
+        if told:
+            (tmp_path / f"{ENV_SERVER}.go").touch()
+
     began = time.monotonic()
-    end, told = carry_on(tmp_path, behaviours, slow, nothing)
+    end, told = carry_on(tmp_path, behaviours, slow, look)
     assert end == End("duration")
-    assert whats(told, LEARNER) in ([("died", 1)], [])  # both end when all are ready
+    assert whats(told, LEARNER) == [("died", 1)]
     assert time.monotonic() - began < 10
     assert ended(tmp_path)[-2:] == [AGENT, RECORDER]
 

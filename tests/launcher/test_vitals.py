@@ -93,3 +93,14 @@ def test_a_later_life_is_judged_by_its_own_words() -> None:
     assert watched.look(ENV_SERVER, seconds=5) == []
     assert watched.look(AGENT, ENV_SERVER, seconds=1, incarnation=2) == []
     assert watched.look(ENV_SERVER, seconds=3, incarnation=2) == [AGENT]
+
+
+def test_each_process_of_a_fleet_is_watched_for_itself() -> None:
+    watched = Watched()
+    first, second = "agent_service.0", "agent_service.1"
+    for process in (first, second):
+        watched.vitals.started(process)
+    assert watched.look(first, second, seconds=1) == []
+    assert watched.look(first, seconds=2.5) == [second]
+    watched.vitals.gone(second)
+    assert watched.look(first, seconds=5) == []

@@ -131,3 +131,54 @@ def test_the_lives_of_strangers_are_bounded() -> None:
     watch.feed(ledger(ENV_SERVER, incarnation=1, seq=1, counters={"ticks": 6}), 0)
     assert watch.refused == 199
     assert watch.totals(ENV_SERVER).counters["ticks"] == 6
+
+
+def fleet_of(count: int) -> Watch:
+    """Env servers that tick at 10 (i + 1) Hz for two seconds, with one episode each, last comers first."""
+    watch = Watch(100.0)
+    for index in reversed(range(count)):
+        for quarter in range(9):
+            stats = ledger(
+                f"env_server.{index}",
+                seq=quarter,
+                at_ns=quarter * SECOND // 4,
+                counters={"ticks": 5 * quarter * (index + 1), "produced": 1},
+                histograms={"loop": [1000 * (index + 1)]},
+                returns=[episode(0, float(index))],
+            )
+            watch.feed(stats, stats.at_ns)
+    return watch
+
+
+def test_a_roles_rates_and_totals_are_those_of_its_processes_together() -> None:
+    watch = fleet_of(3)
+    assert watch.rate("env_server.1", "ticks") == 40.0
+    assert watch.rate(ENV_SERVER, "ticks") == 20.0 + 40.0 + 60.0
+    assert watch.totals("env_server.1").counters["ticks"] == 80
+    total = watch.totals(ENV_SERVER)
+    assert total.counters == {"ticks": 40 + 80 + 120, "produced": 3}
+    assert total.histograms["loop"].count == 3
+    assert watch.totals("env_server.1").histograms["loop"].count == 1  # putting together changes no part
+    assert watch.totals("env_server").histograms["loop"].count == 3
+
+
+def test_returns_are_in_the_environments_order() -> None:
+    assert fleet_of(12).totals(ENV_SERVER).returns == [float(index) for index in range(12)]  # 9, 10, 11
+
+
+def test_who_died_is_out_of_the_roles_rate() -> None:
+    watch = fleet_of(2)
+    watch.happened(happening("died", "env_server.1"))
+    assert watch.rate(ENV_SERVER, "ticks") == 20.0
+    assert watch.down == {"env_server.1"}
+    assert watch.heard("env_server.0") and not watch.heard("env_server.1")
+    assert watch.totals(ENV_SERVER).counters["ticks"] == 40 + 80
+
+
+def test_who_has_ended_is_out_of_it_while_others_go_on() -> None:
+    watch = fleet_of(2)
+    for index, left in ((1, 20.0), (0, 20.0 + 40.0)):  # the last rates stay when all have ended
+        last = ledger(f"env_server.{index}", seq=9, at_ns=2 * SECOND, final=True,
+                      counters={"ticks": 40 * (index + 1)})  # fmt: skip
+        watch.feed(last, 2 * SECOND)
+        assert watch.rate(ENV_SERVER, "ticks") == left

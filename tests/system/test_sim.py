@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -12,9 +13,11 @@ import safetensors.numpy
 
 from env_server.worlds.registry import resolve
 from experiments.presets import pointmass
-from launcher.sim import simulate
+from launcher.sim import Simulation, simulate
 from launcher.summary import Summary, discrepancies, summarise
 from learner.resume import CHECKPOINT_DIR
+from rtcore import channels
+from rtcore.cast import role_of
 from rtcore.config import ForecastConfig, RunConfig, ScheduleConfig
 from rtcore.lifecycle import Stop
 from rtcore.run_dir import RunDir
@@ -114,3 +117,90 @@ def test_it_learns_to_follow(tmp_path: Path) -> None:
     config = replace(small(), duration_s=120.0, learner=learner)
     returns = run(tmp_path / "long", config)[0]["returns"]
     assert fmean(returns[-20:]) > 0.6 * fmean(returns[:3])  # returns are negative
+
+
+def fleet(count: int = 3, **learner: Any) -> RunConfig:
+    """Ten seconds: 2 windows of 3 + 2 units (1 s, 40 ticks)."""
+    base = small(**({"utd": 0.25} | learner))
+    return replace(base, duration_s=10.0, env=replace(base.env, count=count))
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Summary, bytes]:
+    return run(tmp_path_factory.mktemp("fleet") / "run", fleet())
+
+
+def test_a_fleet_is_the_same_to_the_bit(three: tuple[Summary, bytes], tmp_path: Path) -> None:
+    assert run(tmp_path / "again", fleet()) == three
+
+
+def test_the_counts_of_a_fleet_by_hand(three: tuple[Summary, bytes]) -> None:
+    """Of each: 400 ticks; an episode is a reset and 50 steps, so 8 resets, 392 steps."""
+    summary = three[0]
+    assert discrepancies(summary) == []
+    assert summary["env_count"] == 3
+    assert (summary["ticks"], summary["resets"], summary["episodes"]) == (1200, 24, 21)
+    assert [summary["transitions"][name] for name in ("produced", "learned", "lost")] == [1176, 1176, 0]
+    assert summary["learner"]["gradient_steps"] == (1176 - 100) // 4
+    published = summary["policies"]["published"]
+    assert published == 6  # 2 windows of 3: 100 transitions, of all, are there before the first unit ends
+    row = {"ticks": 400, "produced": 392, "learned": 392, "lost": 0, "missed": 0, "adopted": published}
+    assert list(summary["envs"]) == ["env0", "env1", "env2"]
+    for env in summary["envs"].values():
+        assert {name: env[name] for name in row} == row
+    assert len({env["mean_return"] for env in summary["envs"].values()}) == 3  # each explores on its own
+
+
+def test_the_first_of_a_fleet_is_the_one_that_is_alone(tmp_path: Path) -> None:
+    """As long as nothing is learned, from the others neither."""
+    alone, first = (
+        run(tmp_path / str(count), fleet(count, learning_starts=10_000))[0]["returns"] for count in (1, 2)
+    )
+    assert len(alone) == 7
+    assert first[:7] == alone
+    assert not set(first[7:]) & set(alone)
+
+
+def test_environments_take_turns(tmp_path: Path) -> None:
+    """Their deadlines are a third of a period apart, so everything happens in the order of time."""
+    config = replace(fleet(), duration_s=1.0)
+    with ExitStack() as stack:
+        simulation = Simulation(config, RunDir.create(tmp_path / "run", config), stack)
+        witness = simulation._hub.bus("client", simulation._clock)
+        steps = witness.queue(channels.STEP, "*", capacity=1000)
+        simulation.run(Stop(), lambda _: None)
+        told = [one.message for one in steps.drain()]
+    assert [(one.tick, one.env) for one in told] == [(k, f"env{i}") for k in range(40) for i in range(3)]
+    assert [one.due_ns for one in told] == sorted({one.due_ns for one in told})
+    assert told[1].due_ns - told[0].due_ns == 25_000_000 // 3
+    assert len({one.observation for one in told[:3]}) == 3
+    assert {one.sent_ns - one.due_ns for one in told} == {0}  # each at its own deadline
+    explored = {tuple(one.decision for one in told[:60] if one.env == f"env{i}") for i in range(3)}
+    assert len(explored) == 3  # the uniform policy does not look at what it sees
+    assert all(pair.agent._closed for pair in simulation.pairs)
+
+
+def test_what_any_agent_fails_with_ends_the_simulation(tmp_path: Path) -> None:
+    config = replace(fleet(), duration_s=1.0)
+    with ExitStack() as stack:
+        simulation = Simulation(config, RunDir.create(tmp_path / "run", config), stack)
+        simulation.pairs[1].agent._failure = ValueError("no such thing")
+        with pytest.raises(ValueError, match="no such thing"):
+            simulation.run(Stop(), lambda _: None)
+
+
+def test_a_stop_leaves_nobody_ahead(tmp_path: Path) -> None:
+    config, stop = fleet(), Stop()
+    run_dir = RunDir.create(tmp_path / "run", config)
+
+    def interrupt(run_time_s: float) -> None:
+        if run_time_s >= 2.0:
+            stop.set("enough")
+
+    stats, _ = simulate(config, run_dir, stop, interrupt)
+    ticks = [
+        life.counters["ticks"] for name, (life,) in stats.items() if role_of(name) == channels.ENV_SERVER
+    ]
+    assert len(ticks) == 3
+    assert len(set(ticks)) == 1
+    assert 80 <= ticks[0] < 90
