@@ -26,7 +26,7 @@ WAIT_S = 0.2  # how long a wait may last before `stop`, or a failure, is looked 
 SPEC_POLL_S = 0.005
 MAX_DECLARED = 256  # incarnations of the env server remembered, the newest
 # An agent that starts again waits so long for a policy as new as its last one, before it acts on what it has.
-# From a file one is there within milliseconds; the learner's link comes back after 250 ms at worst.
+# From a file one is there within milliseconds; the learner's link comes back after 100 ms or so.
 PREPARE_S = 0.3
 HANGS_NS = 1_000_000_000  # an answer takes under a millisecond
 AGENT_STREAM = 1  # keeps the agent's random numbers apart from the world's and the learner's

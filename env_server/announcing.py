@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from env_server.worlds.period import num_ticks
 from rtcore import cast, channels, epoch
 from rtcore.bus import Bus
 from rtcore.cast import Part
@@ -67,8 +68,8 @@ def wait_for_peers(config: RunConfig, past: Past, bus: Bus, clock: Clock, ledger
     """Wait until all other processes of the run are there: whoever comes later finds only the newest policy.
     `env.start_wait_s` at most, and where the run has begun already 1.2 s.
     """
-    wait_s, run_dir = config.env.start_wait_s, past.run_dir
-    if run_dir is not None and epoch.read(run_dir.epoch_path) is not None:
+    wait_s, returns = config.env.start_wait_s, _has_begun(past)
+    if returns:
         wait_s = min(wait_s, RETURN_WAIT_S)
     peers = {*cast.names(config, record=config.recorder.record)} - {past.part.name}
     limit_ns = clock.now_ns() + round(wait_s * 1e9)
@@ -79,8 +80,14 @@ def wait_for_peers(config: RunConfig, past: Past, bus: Bus, clock: Clock, ledger
             names = " and ".join(sorted(missing))
             ledger.event(now_ns, "WARN", f"starting without {names} after {wait_s:g} s")
             return
+        if not returns and _has_begun(past):  # another env server has waited long enough: T0 is set
+            return
         if stop.wait(min(PEERS_POLL_S, (limit_ns - now_ns) / 1e9)):
             return
+
+
+def _has_begun(past: Past) -> bool:
+    return past.run_dir is not None and epoch.read(past.run_dir.epoch_path) is not None
 
 
 def begin(config: RunConfig, past: Past, clock: Clock, ledger: Ledger, *, tick_ns: int) -> Beginning:
@@ -89,8 +96,7 @@ def begin(config: RunConfig, past: Past, clock: Clock, ledger: Ledger, *, tick_n
     Raises:
         ConfigError: the run's beginning cannot be read.
     """
-    num_ticks = max(1, round(config.duration_s * 1e9 / tick_ns))
-    end_index = num_ticks if config.duration_s > 0 else None
+    end_index = num_ticks(config.env, config.duration_s) or None
     run_dir, now_ns, unix_ns = past.run_dir, clock.now_ns(), past.wall_ns()
     boot_id = "" if run_dir is None else epoch.this_boot()
     process, alone = past.part.name, past.part.index is None
@@ -99,22 +105,25 @@ def begin(config: RunConfig, past: Past, clock: Clock, ledger: Ledger, *, tick_n
     if run_dir is None:
         return Beginning(shifted(proposed, config, past.part, tick_ns), 0, end_index)
     if not alone:  # T0 is one for all
-        agreed, _ = epoch.agree(run_dir.epoch_path, proposed, now_ns=now_ns, wall_ns=unix_ns)
+        agreed, problem = epoch.agree(run_dir.epoch_path, proposed, now_ns=now_ns, wall_ns=unix_ns)
+        if problem is not None:
+            text = f"T0 is not on disk ({problem}): this environment goes by one of its own"
+            ledger.event(now_ns, "ERROR", text)
         proposed = shifted(agreed, config, past.part, tick_ns)
     settled, problem = epoch.settle(run_dir.lives_path(process), proposed, now_ns=now_ns, wall_ns=unix_ns)
     if problem is not None:
         text = f"the run's beginning is not on disk ({problem}): a later env server would begin anew"
         ledger.event(now_ns, "WARN", text)
-    if settled.lives == 1 and alone:  # of a fleet's, another one may have begun
+    # Of a fleet another one may have set T0 long ago, and written files may have taken long.
+    if settled.lives == 1 and (alone or clock.now_ns() < settled.t0_ns):
         return Beginning(settled, 0, end_index)
     lives = [stats.counters for stats in run_dir.read_final_stats() if stats.process == process]
     return go_on(settled, lives, now_ns=clock.now_ns(), tick_ns=tick_ns, end_index=end_index)
 
 
 def shifted(agreed: Epoch, config: RunConfig, part: Part, tick_ns: int) -> Epoch:
-    """The beginning as this environment of a fleet keeps it: the deadlines of all are spread evenly over a
-    period, so that they do not all want the same core at once."""
-    offset_ns = part.number * tick_ns // config.env.count
+    """The beginning as this environment of a fleet keeps it."""
+    offset_ns = cast.offset_ns(part.number, config.env.count, tick_ns)
     return replace(agreed, t0_ns=agreed.t0_ns + offset_ns, wall_t0_ns=agreed.wall_t0_ns + offset_ns)
 
 

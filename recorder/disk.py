@@ -11,7 +11,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from recorder.finish import MAGIC, set_aside
+from recorder.finish import MAGIC, files_of, set_aside
 from recorder.frames import END, MESSAGE_HEAD, STREAM_HEAD
 from recorder.place import Kept, Place, PlaceFile
 from rtcore.clock import Clock
@@ -49,6 +49,7 @@ class RecordingFile:
         place: how far the recording has got; where an earlier life ended, until the first `append`.
         trouble: why the disk takes nothing at present; empty: it does.
         unplaced: why the place is not kept; empty: it is.
+        unread: why it is not known how far what is there had got; empty: it is, or nothing is there.
         part: where that which earlier lives wrote lies until the end; None: there was none.
     """
 
@@ -61,7 +62,7 @@ class RecordingFile:
         self._length = 0
         self._retry_ns = 0
         self.place = Place()
-        self.trouble = self.unplaced = ""
+        self.trouble = self.unplaced = self.unread = ""
         self.part: Path | None = None
 
     def resume(self) -> None:
@@ -69,6 +70,9 @@ class RecordingFile:
         self._earlier = self._place_file.read()
         if self._earlier is not None:
             self.place = self._earlier.place
+        else:
+            with suppress(OSError):  # then nothing can be written either, which is told
+                self.unread = self._place_file.unread if files_of(self._path) else ""
 
     def append(self, data: bytes, place: Place) -> bool:
         """Write a piece, whole or not at all, up to this place. Never waits: after a failure there is no new

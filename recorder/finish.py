@@ -1,6 +1,6 @@
 """The end of a recording, orderly or not: compacted, given a footer, checked. Needs no rerun import.
 
-After a crash of everything: `python -m recorder.finish RECORDING`.
+After a crash of everything, or for one that was too long: `python -m recorder.finish RECORDING`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ from recorder.frames import join
 
 TIMEOUT_S = 120.0  # measured: 1.3 s for 23 MB in 15 000 chunks, so an hour at 50 Hz stays below 20 s
 # Measured: 18 MB/s of a small file; beside others 8 MB/s of 923 MB, for which it took 2.1 GB of memory. What
-# no machine will manage is not begun; whoever asks for it by hand gets the time that it takes.
-MOST_BYTES_PER_S, LEAST_BYTES_PER_S = 40e6, 4e6
+# cannot be done in time is not begun; whoever asks for it by hand gets the time that it takes.
+MOST_BYTES_PER_S, LEAST_BYTES_PER_S = 20e6, 4e6
+# What could not be compacted is joined, a plain copy (measured: 0.9 GB/s), by this share of the time more; as
+# what was begun is small, half a second will do.
+JOIN_SHARE, LEAST_JOIN_S = 0.5, 0.5
 # The program itself: `python -m rerun_cli` (0.41) ends with 0 whatever happened and would stand between us
 # and it, and `python -m rerun` imports all of rerun.
 CLI = (
@@ -39,16 +42,21 @@ MAGIC = b"RRF2"  # begins every recording
 
 
 class FinishError(RuntimeError):
-    """The recording could not be finished; the file is as it was."""
+    """The recording could not be finished; `files_of` says where its rows are."""
 
 
 class TooSlowError(FinishError):
-    """There was not the time for it; what earlier incarnations wrote is in the recording all the same."""
+    """There was not the time for it."""
 
 
 def parts_of(recording: Path) -> list[Path]:
     """Files that earlier incarnations of the recorder left beside `recording`, oldest first."""
     return sorted(recording.parent.glob(f"{recording.stem}.part*.rrd"))
+
+
+def files_of(recording: Path) -> list[Path]:
+    """Where the rows are: the parts that earlier incarnations left, oldest first, and `recording` itself."""
+    return [path for path in [*parts_of(recording), recording] if not _empty(path)]
 
 
 def set_aside(recording: Path, counts: tuple[int, int] | None = None) -> Path | None:
@@ -80,30 +88,32 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
     """Replace `recording` by its compacted, complete and verified form, in one step.
 
     Takes in the parts of earlier incarnations, and repairs what a kill -9 left behind: a missing footer,
-    a torn last chunk. Killed itself, at any instant, it can be called again.
+    a torn last chunk. If that fails, it still makes one file of them if it can, as a kill -9 leaves it:
+    readable, not compact, not checked. Killed itself, at any instant, it can be called again.
 
     Args:
         recording: the file.
-        timeout_s: for all of it.
+        timeout_s: for all of it; making one file at least may take half as long again.
 
     Raises:
-        TooSlowError: see there. It is one file as a kill -9 leaves it: readable, not compact, not checked.
-        FinishError: it did not work; no row is lost, nor there twice.
+        TooSlowError: there was not the time.
+        FinishError: it did not work. Either way no row is lost, nor there twice.
     """
     workshop = recording.with_name(f".{recording.stem}.finishing-{os.getpid()}")
     working = workshop / recording.name
+    due_s = time.monotonic() + timeout_s * (1 + JOIN_SHARE)
     try:
         _clear(recording)
         _settle(recording)
-        sources = [_checked(path) for path in [*parts_of(recording), recording] if not _empty(path)]
+        sources = [_checked(path) for path in files_of(recording)]
         if not sources:
             raise FinishError(f"{recording.name}: nothing was written")
         workshop.mkdir()
         try:
             _compact(sources, working, timeout_s)
-        except TooSlowError:
+        except (FinishError, OSError):
             if len(sources) > 1:
-                join(sources, working)
+                _join(sources, working, max(due_s, time.monotonic() + LEAST_JOIN_S))
                 working.rename(_finished(recording))
                 _settle(recording)
             raise
@@ -117,7 +127,7 @@ def finish(recording: Path, *, timeout_s: float = TIMEOUT_S) -> None:
 
 def _compact(sources: Sequence[Path], working: Path, timeout_s: float) -> None:
     """Make `working` of the sources, and check it, all in so much time."""
-    size = sum(source.stat().st_size for source in sources)
+    size = _size(sources)
     if size > timeout_s * MOST_BYTES_PER_S:
         raise TooSlowError(f"{size / 1e6:,.0f} MB take over {timeout_s:.2g} s")
     due_s = time.monotonic() + timeout_s
@@ -125,6 +135,18 @@ def _compact(sources: Sequence[Path], working: Path, timeout_s: float) -> None:
     run_cli(optimise, timeout_s=timeout_s, home_in=working.parent)
     rest_s = max(0.0, due_s - time.monotonic())
     run_cli(["rrd", "verify", str(working)], timeout_s=rest_s, home_in=working.parent)
+
+
+def _join(sources: Sequence[Path], working: Path, due_s: float) -> None:
+    """Make `working` of the sources as they are."""
+    try:
+        join(sources, working, due_s)
+    except TimeoutError as error:
+        raise TooSlowError(f"there was not even the time to join {_size(sources) / 1e6:,.0f} MB") from error
+
+
+def _size(sources: Sequence[Path]) -> int:
+    return sum(source.stat().st_size for source in sources)
 
 
 def _clear(recording: Path) -> None:
@@ -194,28 +216,32 @@ def run_cli(arguments: Sequence[str], *, timeout_s: float, home_in: Path | None 
     where = None if home_in is None else home_in.absolute()
     with tempfile.TemporaryDirectory(prefix="tenuto-", dir=where) as home:
         switch_off_statistics(Path(home))
-        command = [sys.executable, "-c", DIE_WITH_PARENT + CLI, str(os.getpid()), *arguments]
-        with subprocess.Popen(
-            command,
-            env={"HOME": home, "NO_COLOR": "1", "RUST_LOG": "warn"},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            process_group=0,
-        ) as child:
-            try:
-                output, _ = child.communicate(timeout=timeout_s)
-            except BaseException as error:
-                child.kill()
-                if isinstance(error, subprocess.TimeoutExpired):
-                    what = f"rerun {' '.join(arguments[:2])} took over {timeout_s:.2g} s"
-                    raise TooSlowError(what) from error
-                raise
-    text = output.decode(errors="replace").strip()
-    if child.returncode != 0:
+        code, text = _ran(arguments, timeout_s, home)
+    if code != 0:
         last = text.splitlines()[-1] if text else "no output"
-        raise FinishError(f"rerun {' '.join(arguments[:2])} failed ({child.returncode}): {last}")
+        raise FinishError(f"rerun {' '.join(arguments[:2])} failed ({code}): {last}")
     return text
+
+
+def _ran(arguments: Sequence[str], timeout_s: float, home: str) -> tuple[int, str]:
+    """Run rerun's command line with this home: its exit code, and what it printed."""
+    with subprocess.Popen(
+        [sys.executable, "-c", DIE_WITH_PARENT + CLI, str(os.getpid()), *arguments],
+        env={"HOME": home, "NO_COLOR": "1", "RUST_LOG": "warn"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        process_group=0,
+    ) as child:
+        try:
+            output, _ = child.communicate(timeout=timeout_s)
+        except BaseException as error:
+            child.kill()
+            if isinstance(error, subprocess.TimeoutExpired):
+                what = f"rerun {' '.join(arguments[:2])} took over {timeout_s:.2g} s"
+                raise TooSlowError(what) from error
+            raise
+    return child.returncode, output.decode(errors="replace").strip()
 
 
 def switch_off_statistics(home: Path) -> None:
@@ -236,12 +262,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Finish a recording; 1 if that fails."""
     parser = argparse.ArgumentParser(prog="python -m recorder.finish", description="Repair a recording.")
     parser.add_argument("recording", type=Path)
-    recording = parser.parse_args(argv).recording
-    size = sum(path.stat().st_size for path in [*parts_of(recording), recording] if path.exists())
+    parser.add_argument(
+        "--within-s", type=float, metavar="S", help="compact it only if that takes no longer; else join it"
+    )
+    given = parser.parse_args(argv)
+    recording, within_s = given.recording, given.within_s
+    if within_s is None:
+        within_s = max(TIMEOUT_S, _size(files_of(recording)) / LEAST_BYTES_PER_S)
     try:
-        finish(recording, timeout_s=max(TIMEOUT_S, size / LEAST_BYTES_PER_S))
+        finish(recording, timeout_s=within_s)
     except FinishError as error:
-        sys.stderr.write(f"{error}\n")
+        files = len(files_of(recording))
+        sys.stderr.write(f"{error}; it is in {files} files\n" if files > 1 else f"{error}\n")
         return 1
     return 0
 

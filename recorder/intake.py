@@ -12,8 +12,9 @@ from rtcore.cast import role_of
 from rtcore.log_reader import LogReader
 from rtcore.messages import Spec, Stats, Step
 
-LOG_CAPACITY = 2_000  # batches of all logs: 100 s of a recorder that hangs, 50 MB at 1 kHz ...
-LEAST_CAPACITY = 400  # ... but of each log 20 s of it
+# Batches of each log, 20 a second: all of its env server's cache, 2000, which comes at once after a restart,
+# and 25 s more of them. At 1 kHz 63 MB, and 0.4 s to read (measured).
+LOG_CAPACITY = 2_500
 STATS_CAPACITY = 2_000
 POLICY_CAPACITY = 64  # a few hundred kB each
 WINDOW_CAPACITY = 2_000
@@ -31,9 +32,8 @@ class Intake:
     """
 
     def __init__(self, bus: Bus, envs: Sequence[str], telemetry: TelemetryRows) -> None:
-        capacity = LOG_CAPACITY if len(envs) == 1 else max(LEAST_CAPACITY, LOG_CAPACITY // len(envs))
         self._specs = {env: bus.latest(channels.SPEC, env) for env in envs}
-        self._logs = {env: LogReader(bus, env, capacity_batches=capacity) for env in envs}
+        self._logs = {env: LogReader(bus, env, capacity_batches=LOG_CAPACITY) for env in envs}
         self._stats = bus.queue(channels.STATS, "*", capacity=STATS_CAPACITY)
         self._notices = bus.queue(channels.WINDOW, capacity=WINDOW_CAPACITY)
         self._policies = bus.queue(channels.POLICY, capacity=POLICY_CAPACITY)
@@ -79,10 +79,10 @@ class Intake:
         received = {env: reader.take() for env, reader in self._specs.items()}
         return {env: spec.message for env, spec in received.items() if spec is not None}
 
-    def take_steps(self, now_ns: int) -> dict[str, list[Step]]:
-        """By environment, new steps in order, each once; those behind a missing one come when it does, or 5 s
-        later."""
-        return {env: log.read(now_ns) for env, log in self._logs.items()}
+    def take_steps(self, env: str, now_ns: int) -> list[Step]:
+        """An environment's new steps in order, each once; those behind a missing one come when it does, or
+        5 s later."""
+        return self._logs[env].read(now_ns)
 
     def give_up_on_gaps(self) -> dict[str, list[Step]]:
         """The steps that still waited for earlier ones; those now count as lost."""

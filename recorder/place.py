@@ -85,22 +85,29 @@ class Kept(msgspec.Struct, frozen=True, array_like=True):
 
 
 class PlaceFile:
-    """The file of the place, of a run with so many environments. Constructing one touches nothing."""
+    """The file of the place, of a run with so many environments. Constructing one touches nothing.
+
+    Attributes:
+        unread: why `read` found nothing; empty: it did.
+    """
 
     def __init__(self, path: Path, num_envs: int = 1) -> None:
         self._path = path
         self._slot_bytes = SLOT_BYTES + (num_envs - 1) * ENV_BYTES
         self._file: int | None = None
         self._generation = 0
+        self.unread = ""
 
     def read(self) -> Kept | None:
         """What an earlier life kept; None if there was none, or if nobody can tell."""
         try:
             data = self._path.read_bytes()
-        except OSError:
+        except OSError as error:
+            self.unread = error.strerror or str(error)
             return None
         found = dict(_whole(data, self._slot_bytes))
         if not found:
+            self.unread = "damaged, or of another version"
             return None
         self._generation = max(found)
         return found[self._generation]

@@ -3,8 +3,9 @@
 Every row stands on all five timelines: `run_time` (ns since T0), `wall` (Unix ns), `tick`, `episode`
 and `unit`. A step brings its own tick, episode and unit; for anything else they follow from the time.
 
-The environments of a fleet have T0, and so `run_time`, `wall` and `tick`, in common; an episode is one
-environment's own.
+The environments of a fleet tick by turns: that of number i of n has a T0 of its own, i/n of a tick after the
+run's, and `run_time` is since that. So equal ticks have equal run times, but `wall`, which is true of all,
+differs by less than a tick. An episode is one environment's own.
 """
 
 from __future__ import annotations

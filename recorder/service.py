@@ -10,11 +10,10 @@ has its whole chunks, and what is said beside them is cut up no more than with o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal
 
 from recorder.disk import RecordingFile
-from recorder.finish import FinishError, finish
+from recorder.finish import FinishError, files_of, finish
 from recorder.grid import GridScene
 from recorder.intake import Intake
 from recorder.place import Place
@@ -36,10 +35,10 @@ DRAIN_NS = 2_000_000_000  # after the stop: so long at most for the others' last
 CHUNK_ROWS = 50  # the knee of cost per row; of each environment that has any
 MIN_AGE_NS = 500_000_000  # a chunk of so many rows waits at least so long ...
 MAX_AGE_NS = 1_000_000_000  # ... and a smaller one at most so long
-MAX_ROWS = 2_000  # of one environment
+MAX_ROWS = 2_000  # of one environment; more of them come after a restart, and are written so many by so many
 PLACE_NAME = "recorder.place"
-# The file is complete without being compacted, so compaction may take only what an end has to spare:
-# whoever interrupts waits 5 s for all of it, at most 2 of them for the others' last words.
+# The file has all rows without being compacted, so compaction may take only what an end has to spare:
+# whoever interrupts waits 4.5 s for all of it, at most 2 of them for the others' last words.
 COMPACT_S = 10.0
 COMPACT_INTERRUPTED_S = 1.5
 LAST_S_NS = 1_000_000_000  # a step in the last second of the duration: nobody interrupted
@@ -89,26 +88,34 @@ class RecorderService:
         recording = self._open()
         for env, spec in self._intake.take_specs().items():
             self._begin(recording, env, spec)
-        now_ns = self._clock.now_ns()
-        self._ledger.beat(now_ns)
-        self._keep(self._intake.take_steps(now_ns))
+        for env in self._envs:  # after a restart each has a history that takes its time
+            self._beat()
+            self._keep(env, self._intake.take_steps(env, self._clock.now_ns()))
+            if len(self._steps[env]) >= MAX_ROWS:
+                self.flush()
         news = self._intake.take_telemetry()
+        now_ns = self._clock.now_ns()
         waiting = [len(steps) for steps in self._steps.values() if steps]
         if self._oldest_ns is None and (waiting or news):
             self._oldest_ns = now_ns
         if self._oldest_ns is not None:
             age_ns = now_ns - self._oldest_ns
             enough = min(waiting, default=0) >= CHUNK_ROWS and age_ns >= MIN_AGE_NS
-            if enough or age_ns >= MAX_AGE_NS or max(waiting, default=0) >= MAX_ROWS:
+            if enough or age_ns >= MAX_AGE_NS:
                 self.flush()
 
     def flush(self) -> None:
         """Write all that has been taken in, of the environments that have declared themselves."""
         if self._writer is None or self._recording is None:
             return
-        steps = {env: self._steps[env] for env in self._writer.begun}
-        self._writer.write(steps, self._telemetry, self._intake.placements)
-        self._steps |= {env: [] for env in steps}
+        for env in self._envs:
+            if env in self._writer.begun:
+                steps, self._steps[env] = self._steps[env], []
+                for begin in range(0, len(steps), MAX_ROWS):
+                    self._beat()
+                    self._writer.write(env, steps[begin : begin + MAX_ROWS])
+        self._beat()
+        self._writer.tell(self._telemetry, self._intake.placements)
         self._oldest_ns = None
         self._sync(self._recording, self._writer.place(self._intake.positions, self._telemetry.told))
         live = self._recording.live
@@ -124,7 +131,8 @@ class RecorderService:
         self._closed = True
         recording = self._open()
         self.poll()
-        self._keep(self._intake.give_up_on_gaps())
+        for env, steps in self._intake.give_up_on_gaps().items():
+            self._keep(env, steps)
         recording.file.insist()
         self.flush()
         if self._writer is None:
@@ -137,13 +145,7 @@ class RecorderService:
                     self._say("WARN", f"{env} never declared itself: the recording has nothing of it")
         recording.close()
         self._account(recording)
-        done = self._due_end_ns is not None and self._newest_ns >= self._due_end_ns - LAST_S_NS
-        try:
-            finish(self._run_dir.recording_path, timeout_s=COMPACT_S if done else COMPACT_INTERRUPTED_S)
-        except FinishError as error:
-            less = recording.dropped or recording.file.trouble
-            what = "has what the disk took, and" if less else "is complete but"
-            self._say("WARN", f"the recording {what} stays as it was written: {error}")
+        self._finish(recording)
 
     def command(self, command: Command) -> CommandReply:
         """Answer an operator; called on the bus's thread."""
@@ -152,12 +154,31 @@ class RecorderService:
         rows, dropped = self._ledger.counter("rows"), self._ledger.counter("dropped")
         return CommandReply(id=command.id, ok=True, text=f"{rows} rows written, {dropped} dropped")
 
+    def _finish(self, recording: Recording) -> None:
+        """Compact what was written, or say where it lies and what to do."""
+        done = self._due_end_ns is not None and self._newest_ns >= self._due_end_ns - LAST_S_NS
+        path = self._run_dir.recording_path
+        try:
+            finish(path, timeout_s=COMPACT_S if done else COMPACT_INTERRUPTED_S)
+        except FinishError as error:
+            files = len(files_of(path))
+            less = recording.dropped or recording.file.trouble
+            has = "what the disk took" if less else "all rows"
+            where = f"is in {files} files" if files > 1 else "stays as it was written"
+            remedy = f"; to complete it: python -m recorder.finish {path}" if files else ""
+            self._say("WARN", f"the recording has {has} but {where}: {error}{remedy}")
+
     def _open(self) -> Recording:
         if self._recording is None:
             run_dir, run = self._run_dir, self._run_dir.run_name
             place_path = run_dir.logs_dir / PLACE_NAME
             file = RecordingFile(run_dir.recording_path, place_path, self._clock, len(self._envs))
             file.resume()
+            if file.unread:
+                text = (
+                    "the recording goes on, but how far it had got is not known: its last rows may come twice"
+                )
+                self._say("WARN", f"{text} ({PLACE_NAME}: {file.unread})")
             self._intake.go_on_from(file.place)
             self._telemetry.go_on_from(file.place.told)
             settings = self._config.recorder
@@ -205,12 +226,14 @@ class RecorderService:
                 self._due_end_ns = spec.t0_ns + round(self._config.duration_s * 1e9)
         self._writer.begin(env, spec)
 
-    def _keep(self, taken: Mapping[str, list[Step]]) -> None:
+    def _keep(self, env: str, steps: list[Step]) -> None:
         """Have steps wait until they are written."""
-        for env, steps in taken.items():
-            self._steps[env] += steps
-            if steps:
-                self._newest_ns = max(self._newest_ns, steps[-1].due_ns)
+        self._steps[env] += steps
+        if steps:
+            self._newest_ns = max(self._newest_ns, steps[-1].due_ns)
+
+    def _beat(self) -> None:
+        self._ledger.beat(self._clock.now_ns())
 
     def _scene(self, spec: Spec) -> Scene | None:
         if spec.scene == "point":

@@ -76,16 +76,16 @@ class RunWriter:
         """The environments that have declared themselves."""
         return frozenset(self._envs)
 
-    def write(
-        self, steps: Mapping[str, list[Step]], telemetry: TelemetryRows, placements: Mapping[str, str]
-    ) -> None:
-        """Write rows of all that came; the steps are by environment, of those begun alone."""
+    def write(self, env: str, steps: list[Step]) -> None:
+        """Write rows of consecutive steps of an environment that has begun."""
+        self._envs[env].write(steps)
+
+    def tell(self, telemetry: TelemetryRows, placements: Mapping[str, str]) -> None:
+        """Write rows of all else that came, after the steps: they say which episode it was."""
         if placements != self._placements:
             self._placements = dict(placements)
             card = run_card(self._run, self._config, self._spec, placements)
             self._recording.static("/run_card", rr.TextDocument(card, media_type="text/markdown"))
-        for env, own in steps.items():
-            self._envs[env].write(own)
         shared, of_envs = self._timelines()
         tables = telemetry.rows(shared, of_envs)
         if telemetry.forecast_names != self._forecast_names:

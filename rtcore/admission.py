@@ -26,6 +26,7 @@ MAX_EVENT_TEXT = 1_000  # characters; a ledger cuts at 500
 MAX_TICK = 1 << 40  # 35 years at 1 kHz
 MAX_BOUND = 1e30  # of an action: its square is not far from what float32 can hold
 MAX_BATCH_STEPS = 10_000
+NUMBERED = ("env_server", "agent_service")  # `rtcore.cast.PER_ENV`, which cannot be imported here; at most 16
 # What makes the environments of a fleet the same task: what was learned in one holds in the others.
 _TASK = (
     "tick_ns", "unit_ns", "observation_dim", "action_dim", "states", "actions", "action_low", "action_high",
@@ -110,7 +111,8 @@ def check_notice(notice: WindowNotice) -> None:
 def check_stats(stats: Stats, speakers: Collection[str]) -> None:
     """A ledger of one of the `speakers`, of a size that a reader can keep, whose histograms decode."""
     role, dot, index = stats.process.partition(".")  # of a fleet's process; see `rtcore.cast`
-    if role not in speakers or (dot and not re.fullmatch(r"\d{1,3}", index)):
+    numbered = role in NUMBERED and re.fullmatch(r"[0-9]|1[0-5]", index)
+    if role not in speakers or (dot and not numbered):
         raise ValueError(f"process = {_short(stats.process)}: is none of ours")
     for table in (stats.counters, stats.gauges, stats.histograms):
         if len(table) > MAX_NAMES:

@@ -55,6 +55,12 @@ def env_names(env: EnvConfig) -> tuple[str, ...]:
     return tuple(f"{env.name.rstrip(_DIGITS)}{index}" for index in range(env.count))
 
 
+def offset_ns(number: int, count: int, tick_ns: int) -> int:
+    """How long after T0 the first deadline of environment `number` of `count` is. Theirs are spread evenly
+    over a period, so that they do not all want the same core at once."""
+    return number * tick_ns // count
+
+
 def parts(config: RunConfig, *, record: bool = True) -> tuple[Part, ...]:
     """All processes, in connect order: each connects to the earlier ones.
 

@@ -5,10 +5,21 @@ from __future__ import annotations
 import dataclasses
 from typing import get_type_hints
 
-from rtcore.config import DEEP, TABULAR, ConfigError, DriftConfig, ForecastConfig, LearnerConfig, RunConfig
+from rtcore.cast import env_names
+from rtcore.config import (
+    DEEP,
+    TABULAR,
+    ConfigError,
+    DriftConfig,
+    EnvConfig,
+    ForecastConfig,
+    LearnerConfig,
+    RunConfig,
+)
 from rtcore.config_rules import rule_for
 from rtcore.windows import make_schedule
 
+LONGEST_OF_FLEET = 40  # characters in an environment's name; see `rtcore.tally`
 LONGEST_CHOSEN = 1000  # units; its cost rises with the square: 0.2 s of the learner's thread for 36 states
 
 
@@ -47,6 +58,7 @@ def _check_together(config: RunConfig) -> None:
     env, learner = config.env, config.learner
     if env.hz is not None:
         check_unit(env.unit_s, env.hz)
+    _check_names(env)
     for name in ("batch", "learning_starts"):
         value = getattr(learner, name)
         if value > learner.replay_capacity:
@@ -61,6 +73,15 @@ def _check_together(config: RunConfig) -> None:
     _check_algorithm(learner)
     _check_forecast(learner.forecast)
     _check_schedule(learner)
+
+
+def _check_names(env: EnvConfig) -> None:
+    """A counter of a fleet ends with the environment's name, and a tally keeps 55 bytes of its own name."""
+    longest = max(env_names(env), key=len)
+    if env.count > 1 and len(longest) > LONGEST_OF_FLEET:
+        most = LONGEST_OF_FLEET - len(str(env.count - 1))
+        allowed = f"must be at most {most} characters, but for a number at its end, with env.count > 1"
+        raise ConfigError("env.name", env.name, allowed)
 
 
 def _check_drift(name: str, drift: DriftConfig) -> None:

@@ -7,6 +7,7 @@ begins anew when the host does: then T0 is converted by the wall clock, and may 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import msgspec
 
 from rtcore.config import ConfigError
 from rtcore.files import write_atomic, write_once
+from rtcore.messages import Spec
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -51,6 +53,14 @@ def this_boot() -> str:
         return ""
 
 
+def on_this_clock(spec: Spec, *, now_ns: int, wall_ns: int, boot_id: str) -> Spec:
+    """The declaration with T0 on the clock of this boot: another host's monotonic clock began when that host
+    did, so the wall clocks are gone by, which must agree."""
+    if spec.host in ("", boot_id):
+        return spec
+    return msgspec.structs.replace(spec, t0_ns=now_ns - (wall_ns - spec.wall_t0_ns))
+
+
 def read(path: Path) -> Epoch | None:
     """The run's beginning as it was written down; None if it was not.
 
@@ -79,7 +89,11 @@ def agree(path: Path, proposed: Epoch, *, now_ns: int, wall_ns: int) -> tuple[Ep
     except FileExistsError:
         known = read(path)
         assert known is not None
-        return known.at(now_ns=now_ns, wall_ns=wall_ns, boot_id=proposed.boot_id), None
+        here = known.at(now_ns=now_ns, wall_ns=wall_ns, boot_id=proposed.boot_id)
+        if here is not known:  # so that all who come after this one on the new boot convert it alike
+            with suppress(OSError):
+                write_atomic(path, _encode(here))
+        return here, None
     except OSError as error:
         return proposed, error
     return proposed, None

@@ -7,6 +7,8 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 
+from msgspec.structs import replace
+
 from rtcore.histogram import Histogram
 from rtcore.messages import EpisodeReturn, Event, Level, Stats, WindowNotice
 from rtcore.tally import Tally
@@ -19,6 +21,7 @@ MAX_TEXT = 500
 REPEAT_NS = 10_000_000_000  # the launcher, the first reader, and the recorder, the last, start 3 s apart
 RECENT_RETURNS = 64
 RECENT_WINDOWS = 4096
+MOST_RETURNS = 20_000  # of 25 bytes: half of the largest message on the channel of stats
 
 LOG_LEVELS: dict[Level, int] = {
     "DEBUG": logging.DEBUG,
@@ -159,3 +162,9 @@ class Ledger:
                 windows=self._windows[0 if final else -RECENT_WINDOWS :],
                 beat_ns=self._beat_ns,
             )
+
+
+def brief(last: Stats) -> Stats:
+    """A final ledger as it goes over the bus: with the newest `MOST_RETURNS` and 4096 windows. The file has
+    all of them."""
+    return replace(last, returns=last.returns[-MOST_RETURNS:], windows=last.windows[-RECENT_WINDOWS:])

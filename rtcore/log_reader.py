@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from rtcore import channels
-from rtcore.admission import check_same_world
+from rtcore.admission import check_same_world, is_same_world
 from rtcore.bus import Bus
 from rtcore.epoch import this_boot
 from rtcore.messages import Spec, Step, StepBatch
@@ -35,6 +35,7 @@ class LogReader:
         self._specs = bus.queue(channels.SPEC, env, capacity=MAX_DECLARED)
         self._batches = bus.queue(channels.LOG, env, capacity=capacity_batches)
         self._capacity = capacity_batches
+        self._world: Spec | None = None  # what it is, whoever declares it
         self._declared: dict[int, Spec] = {}
         self._undeclared: deque[tuple[int, StepBatch]] = deque()  # with the instant at which it was read
         self._waiting_since_ns: int | None = None  # a step is missing since then
@@ -44,6 +45,15 @@ class LogReader:
     def go_on_from(self, position: tuple[int, int] | None) -> None:
         """Begin at this (incarnation, seq), where an earlier reader ended. Call it before reading."""
         self.stream = StepStream(position)
+
+    def expect(self, spec: Spec) -> None:
+        """Take what the caller has accepted for what the world is: a declaration of another one is refused,
+        whichever came first."""
+        self._world = spec
+        foreign = [key for key, one in self._declared.items() if not is_same_world(one, spec)]
+        for incarnation in foreign:
+            del self._declared[incarnation]
+            self._bus.reject(channels.SPEC, f"incarnation {incarnation}: another world than the one expected")
 
     @property
     def ended(self) -> bool:
@@ -81,17 +91,25 @@ class LogReader:
         self._undeclared.clear()
         return self.stream.flush()
 
+    def discard(self) -> int:
+        """Leave unread what has come, instead of reading; returns the number of steps."""
+        self._specs.drain()
+        batches = [batch for _, batch in self._undeclared]
+        batches += [received.message for received in self._batches.drain()]
+        self._undeclared.clear()
+        return sum(len(batch.steps) for batch in batches)
+
     def _declare(self, spec: Spec) -> None:
+        self._world = self._world or spec
         try:
-            if self._declared:
-                check_same_world(spec, next(iter(self._declared.values())))
+            check_same_world(spec, self._world)
         except ValueError as error:
             self._bus.reject(channels.SPEC, error)
             return
         self._boot = self._boot or this_boot()
         self._declared[spec.incarnation] = spec
-        if len(self._declared) > MAX_DECLARED:  # the first one stays: it tells what the world is
-            del self._declared[min(list(self._declared)[1:])]
+        if len(self._declared) > MAX_DECLARED:
+            del self._declared[min(list(self._declared)[1:])]  # the first one stays
 
     def _admitted(self, batches: list[StepBatch], now_ns: int) -> list[StepBatch]:
         """What may be taken now, oldest first."""

@@ -24,7 +24,7 @@ from rtcore.cast import Part
 from rtcore.clock import Clock
 from rtcore.config import ConfigError, RunConfig
 from rtcore.crew import Crew
-from rtcore.ledger import Ledger
+from rtcore.ledger import Ledger, brief
 from rtcore.lifecycle import Continuations, Stop, die_with_parent, stop_on_signals
 from rtcore.log_files import log_to_file
 from rtcore.messages import Stats
@@ -206,7 +206,7 @@ def open_process(role: str, argv: Sequence[str] | None = None) -> Iterator[Proce
         finally:
             last = reporter.snapshot(final=True)
             _keep(run_dir, last)
-            reporter.publish(last)
+            reporter.publish(brief(last))
 
 
 def _keep(run_dir: RunDir, last: Stats) -> None:

@@ -140,13 +140,13 @@ def step_back() -> None:
 
 
 @contextlib.contextmanager
-def out_of_the_way(rt: Rt) -> Iterator[None]:
-    """Keep a process that only watches off the acting pair's core, if there is another, inside the block.
+def out_of_the_way(rt: Rt, crew: Crew = ALONE) -> Iterator[None]:
+    """Keep a process that only watches off the acting pairs' cores, if there is another, inside the block.
 
     Enter it once the processes that are watched have been started: they would inherit it.
     """
     allowed = allowed_cores()
-    others = allowed[1:]
+    others = allowed[crew.cores(len(allowed)) :]
     if rt == "off" or not others:
         yield
         return

@@ -46,6 +46,7 @@ class RunDir:
         run = cls(_absolute(path))
         try:
             run._make(dump_toml(config).encode())
+            run.remove_socket_dir()  # of an earlier run at this path: nobody has joined this one
         except FileExistsError as error:
             raise ConfigError("run_dir", str(run.path), "must not exist yet") from error
         except (OSError, ValueError) as error:

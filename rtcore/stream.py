@@ -8,7 +8,9 @@ once; `Transitions` pairs them.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -113,7 +115,8 @@ class StepStream:
         if step.incarnation < self._incarnation:
             self.late += 1
         elif step.seq < self._next:
-            given_up = any(step.seq in lost for lost in self._lost)
+            at = bisect_right(self._lost, step.seq, key=attrgetter("start")) - 1  # they rise
+            given_up = at >= 0 and step.seq in self._lost[at]
             self.late += given_up
             self.duplicate += not given_up
         elif step.seq in self._waiting:

@@ -73,6 +73,14 @@ def tick_ns(env: EnvConfig) -> int:
     return max(1, round(1e9 / env.hz))
 
 
+def num_ticks(env: EnvConfig, duration_s: float) -> int:
+    """Deadlines in a run of `duration_s`, one at least; 0: it goes on until stopped.
+
+    By the whole nanoseconds of a period: duration times rate is one more in two hours at 600 Hz.
+    """
+    return max(1, round(duration_s * 1e9 / tick_ns(env))) if duration_s > 0 else 0
+
+
 def _without_scale(env: EnvConfig) -> EnvConfig:
     if env.speed is not None:
         raise ConfigError("env.speed", env.speed, f"{env.id} has no native period; give env.hz alone")

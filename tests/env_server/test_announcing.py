@@ -186,6 +186,27 @@ def test_a_fleet_waits_for_everybody_but_itself(tmp_path: Path) -> None:
     assert clock.now_ns() - START_NS == 15_000 * MS
 
 
+def test_a_fleet_begins_together_though_somebody_is_missing(tmp_path: Path) -> None:
+    """The recorder never comes. The first env server gives up after 15 s; the second, which came a second
+    later, then waits no longer, and begins at tick 0 as well."""
+    config = run_config(count=2, start_wait_s=15.0)
+    run_dir, clock = RunDir.create(tmp_path / "run", config), VirtualClock(START_NS)
+    pasts = [Past(run_dir, lambda: WALL_NS, Part(channels.ENV_SERVER, index)) for index in (0, 1)]
+    ledger = Ledger("env_server.1", 1)
+
+    class Waiting(Ticking):
+        def wait(self, timeout_s: float) -> bool:
+            if self._clock.now_ns() >= START_NS + 14_000 * MS and not run_dir.epoch_path.exists():
+                begin(config, pasts[0], clock, Ledger("env_server.0", 1), tick_ns=TICK_NS)
+            return super().wait(timeout_s)
+
+    bus = MemoryHub().bus("env_server.1", clock)
+    wait_for_peers(config, pasts[1], bus, clock, ledger, Waiting(clock))
+    assert clock.now_ns() - START_NS < 14_200 * MS
+    found = begin(config, pasts[1], clock, ledger, tick_ns=TICK_NS)
+    assert (found.first_index, found.down) == (0, 0)
+
+
 def test_a_life_after_the_end_does_not_tick(tmp_path: Path) -> None:
     lives = Lives(tmp_path, run_config())
     lives.live(25, down_s=5.0)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from env_server.worlds.period import Timing, physics_steps, resolve_period, tick_ns
+from env_server.worlds.period import Timing, num_ticks, physics_steps, resolve_period, tick_ns
 from rtcore.config import ConfigError, EnvConfig
 
 CHEETAH = Timing(native_s=0.05, physics_s=0.01)
@@ -83,3 +83,19 @@ def test_tick_ns() -> None:
     assert tick_ns(EnvConfig(hz=30.0)) == 33_333_333
     with pytest.raises(ConfigError, match=r"env.hz"):
         tick_ns(EnvConfig())
+
+
+@pytest.mark.parametrize(
+    ("hz", "duration_s", "count"),
+    [
+        (100.0, 40.0, 4000),
+        (600.0, 7200.0, 4_319_999),  # 7200 s / 1 666 667 ns = 4 319 999.1; duration times rate is one more
+        (1900.0, 1800.0, 3_419_999),  # 1800 s / 526 316 ns = 3 419 998.6; likewise
+        (0.5, 0.1, 1),
+        (100.0, 0.0, 0),
+    ],
+)
+def test_deadlines_are_counted_by_the_whole_nanoseconds_of_a_period(
+    hz: float, duration_s: float, count: int
+) -> None:
+    assert num_ticks(EnvConfig(hz=hz), duration_s) == count

@@ -59,7 +59,7 @@ def test_the_recorder_does_not_wait_for_its_last_words() -> None:
     )
     stage.herald.tell(DIED)
     stage.pulse(0.1)
-    intake.take_steps(stage.clock.now_ns())
+    intake.take_steps("env0", stage.clock.now_ns())
     assert intake.take_telemetry() == 1
     assert intake.complete
 

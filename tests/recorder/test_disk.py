@@ -128,8 +128,7 @@ def test_a_directory_that_stays_read_only_ends_without_a_recording_and_says_so(s
     record(stage, 60)
     stage.service.close()
     assert texts(stage)[1:] == [
-        "the recording has what the disk took, and stays as it was written: "
-        "recording.rrd: nothing was written"
+        "the recording has what the disk took but stays as it was written: recording.rrd: nothing was written"
     ]
     assert stage.ledger.counter("rows") == 0
     assert stage.ledger.counter("dropped") == 60 * 9
@@ -142,7 +141,7 @@ def test_a_disk_that_is_full_at_the_end_leaves_the_recording_as_it_was_written(s
     fill(small_disk)
     stage.service.close()
     (text,) = texts(stage)
-    assert text.startswith("the recording is complete but stays as it was written: ")
+    assert text.startswith("the recording has all rows but stays as it was written: ")
     assert reading.columns(stage.path, "/env/reward")[0].tolist() == list(range(60))
     assert sorted(path.name for path in stage.path.parent.glob("*.rrd")) == ["recording.rrd"]
     assert not list(stage.path.parent.glob(".recording*"))

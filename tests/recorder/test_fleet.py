@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import msgspec
-import numpy as np
 import pytest
 
 from recorder import reading
-from recorder.intake import LEAST_CAPACITY, LOG_CAPACITY, Intake
+from recorder.intake import Intake
 from recorder.place import ENV_BYTES, SLOT_BYTES
-from recorder.rows import roots
-from recorder.telemetry import TelemetryRows
-from rtcore import channels
-from rtcore.bus import Publisher
-from rtcore.channels import Channel
-from rtcore.clock import VirtualClock
-from rtcore.config import EnvConfig
 from rtcore.lifecycle import Stop
-from rtcore.memory_bus import MemoryBus, MemoryHub
-from rtcore.messages import Event, Step, StepBatch
+from rtcore.messages import Event
+from tests.recorder.fleet_stage import Fleet, set_fleet, tick_of, ticks
 from tests.recorder.stage import (
-    CONFIG,
     MS,
     SPEC,
     T0,
@@ -41,58 +28,6 @@ from tests.recorder.stage import (
 )
 
 TIMELINES = {"run_time", "wall", "tick", "episode", "unit"}
-
-
-@dataclass
-class Fleet:
-    """The env servers of a stage's run."""
-
-    stage: Stage
-
-    def __post_init__(self) -> None:
-        self._logs: dict[str, Publisher[StepBatch]] = {}
-
-    def declare(self, *envs: str, **changes: Any) -> None:
-        for env in envs:
-            spec = msgspec.structs.replace(SPEC, env=env, **changes)
-            self.stage.bus.publisher(channels.SPEC, env).put(spec)
-
-    def send(self, env: str, steps: Sequence[Step], *, last: bool = False) -> None:
-        if env not in self._logs:
-            self._logs[env] = self.stage.bus.publisher(channels.LOG, env)
-        own = [msgspec.structs.replace(step, env=env) for step in steps]
-        self._logs[env].put(StepBatch(steps=own, last=last))
-
-    def play(self, seqs: range, *envs: str, size: int = 10, last: bool = False) -> None:
-        """All envs tick together; the reward tells them apart, and so do the episodes: env1's are longer."""
-        for begin in range(seqs.start, seqs.stop, size):
-            part = range(begin, min(begin + size, seqs.stop))
-            self.stage.clock.sleep_until_ns(T0 + part[-1] * TICK + MS)
-            for env in envs:
-                self.send(env, [tick_of(env, seq) for seq in part], last=last and part.stop == seqs.stop)
-            self.stage.service.poll()
-
-
-def tick_of(env: str, seq: int) -> Step:
-    number = int(env[-1])
-    length = 10 + 5 * number
-    return make_step(
-        seq,
-        episode=seq // length,
-        episode_tick=seq % length,
-        truncated=seq % length == length - 1,
-        reward=0.0 if seq % length == 0 else 100.0 * number + seq,
-        position=np.array([0.1 * seq + number], "<f8").tobytes(),
-    )
-
-
-def set_fleet(tmp_path: Path, count: int = 2) -> Fleet:
-    return Fleet(set_stage(tmp_path, config=replace(CONFIG, env=replace(CONFIG.env, count=count))))
-
-
-def ticks(stage: Stage, env: str) -> list[int]:
-    found: list[int] = reading.columns(stage.path, f"/{env}/env/reward")[0].tolist()
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -347,42 +282,18 @@ def test_the_last_words_of_all_are_waited_for(
     assert stage.clock.now_ns() - begin_ns == pytest.approx(waited_s * 1e9, abs=50 * MS)
 
 
-@pytest.mark.parametrize(("count", "each"), [(1, LOG_CAPACITY), (4, 500), (16, LEAST_CAPACITY)])
-def test_queues_are_bounded_together(monkeypatch: pytest.MonkeyPatch, count: int, each: int) -> None:
-    given: list[int] = []
-    queue = MemoryBus.queue
-
-    def counted(bus: MemoryBus, channel: Channel[Any], name: str = "", *, capacity: int = 10_000) -> Any:
-        if channel is channels.LOG:
-            given.append(capacity)
-        return queue(bus, channel, name, capacity=capacity)
-
-    monkeypatch.setattr(MemoryBus, "queue", counted)
-    bus = MemoryHub().bus(channels.RECORDER, VirtualClock(T0))
-    Intake(bus, [f"env{i}" for i in range(count)], TelemetryRows())
-    assert given == [each] * count
-
-
-@pytest.mark.parametrize(
-    ("env", "expected"),
-    [
-        (EnvConfig(), {"env0": ""}),
-        (EnvConfig(count=2), {"env0": "/env0", "env1": "/env1"}),
-        (EnvConfig(name="left arm", count=2), {"left arm0": "/left_arm0", "left arm1": "/left_arm1"}),
-    ],
-)
-def test_only_in_a_fleet_entities_lie_below_the_environments_name(
-    env: EnvConfig, expected: dict[str, str]
-) -> None:
-    assert roots(env) == expected
-
-
-def test_the_roots_read_back_are_in_the_order_of_their_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    fleet = [f"/env{i}/{entity}" for i in (10, 9, 0) for entity in ("env/reward", "world/env/g1")]
-    for found, expected in (
-        ([*fleet, "/learner/loss/env", "/log"], ["/env0", "/env9", "/env10"]),
-        (["/env/reward", "/world/agent/g1", "/world/body1/g1"], [""]),
-        (["/log", "/run_card"], []),
-    ):
-        monkeypatch.setattr(reading, "entities", lambda _, found=found: found)
-        assert reading.env_roots("r.rrd") == expected
+def test_equal_ticks_have_equal_run_times_and_their_own_wall_times(tmp_path: Path) -> None:
+    fleet = set_fleet(tmp_path)
+    fleet.declare("env0")
+    late = TICK // 2  # the second of two ticks half a tick later
+    fleet.declare("env1", t0_ns=T0 + late, wall_t0_ns=SPEC.wall_t0_ns + late)
+    fleet.send("env0", [tick_of("env0", seq) for seq in range(20)])
+    fleet.send("env1", [make_step(seq, due_ns=T0 + late + seq * TICK) for seq in range(20)])
+    fleet.stage.service.poll()
+    fleet.stage.service.close()
+    expected: dict[reading.TimelineName, int] = {"tick": 0, "run_time": 0, "wall": late}
+    for timeline, apart in expected.items():
+        of_envs = [
+            reading.columns(fleet.stage.path, f"/env{i}/env/reward", timeline=timeline)[0] for i in range(2)
+        ]
+        assert (of_envs[1] - of_envs[0]).tolist() == [apart] * 20, timeline

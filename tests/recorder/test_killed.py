@@ -99,17 +99,29 @@ def test_a_killed_finish_neither_loses_nor_doubles_a_row(
     assert not list(third.path.parent.glob(".recording*"))
 
 
-def test_without_a_place_what_there_was_is_kept_all_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gone", [False, True])
+def test_without_a_place_what_there_was_is_kept_all_the_same_and_it_is_told(
+    gone: bool, tmp_path: Path
+) -> None:
     first = set_stage(tmp_path)
     first.spec.put(SPEC)
     first.steps([make_step(seq) for seq in range(60)])
     first.service.flush()
-    (first.run_dir.logs_dir / "recorder.place").write_bytes(b"\xff" * 70_000)
+    place = first.run_dir.logs_dir / "recorder.place"
+    if gone:
+        place.unlink()
+    else:
+        place.write_bytes(b"\xff" * 70_000)
     second = come_back(first)
     second.steps([make_step(seq) for seq in range(80)], size=80, last=True)
     second.service.close()
     ticks = reading.columns(second.path, "/env/reward")[0].tolist()
     assert sorted(set(ticks)) == list(range(80))
+    why = "No such file or directory" if gone else "damaged, or of another version"
+    assert [event.text for event in second.events() if event.level == "WARN"] == [
+        "the recording goes on, but how far it had got is not known: its last rows may come twice "
+        f"(recorder.place: {why})"
+    ]
 
 
 def test_what_a_dead_recorder_could_not_have_is_counted(tmp_path: Path) -> None:

@@ -175,9 +175,31 @@ def test_if_finishing_fails_the_raw_file_stays_and_it_is_told(
     run(stage, [make_step(seq) for seq in range(60)])
     (event,) = stage.events()
     assert event.level == "WARN"
-    assert event.text.endswith("is complete but stays as it was written: rerun rrd optimize took over 1.5 s")
+    assert event.text == (
+        "the recording has all rows but stays as it was written: rerun rrd optimize took over 1.5 s; "
+        f"to complete it: python -m recorder.finish {stage.path}"
+    )
     assert reading.columns(stage.path, "/env/reward")[0].tolist() == list(range(60))
     run_cli(["rrd", "verify", "--check-footers=false", str(stage.path)], timeout_s=10)
+
+
+def test_if_not_even_one_file_can_be_made_it_is_told_of_how_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(recording: Path, *, timeout_s: float) -> None:
+        raise FinishError("no space")
+
+    monkeypatch.setattr(recorder.service, "finish", fail)
+    stage = set_stage(tmp_path)
+    stage.spec.put(SPEC)
+    for begin in (0, 60, 120):
+        stage.steps([make_step(seq) for seq in range(begin, begin + 60)])
+        stage.service.flush()  # and then it dies
+        stage = come_back(stage)
+    stage.steps([make_step(seq) for seq in range(180, 200)], last=True)
+    stage.service.close()
+    text = stage.events()[-1].text
+    assert text.startswith("the recording has all rows but is in 4 files: no space; to complete it: ")
 
 
 @pytest.mark.parametrize(("ticks", "patience"), [(60, 1.5), (100, 10.0)])

@@ -125,6 +125,9 @@ def test_a_phase_that_cannot_be(fields: dict[str, Any]) -> None:
     ("fields", "reason"),
     [
         ({"process": "learner.x"}, "process = 'learner.x': is none of ours"),
+        ({"process": "learner.3"}, r"process = 'learner\.3': is none of ours"),
+        ({"process": "env_server.16"}, r"process = 'env_server\.16': is none of ours"),
+        ({"process": "agent_service.٣"}, "is none of ours"),
         ({"process": "env_server."}, r"process = 'env_server\.': is none of ours"),
         ({"process": "nobody"}, "process = 'nobody': is none of ours"),
         ({"process": "x" * 300}, r"process = 'x{79}\.\.\.: is none of ours"),

@@ -10,6 +10,8 @@ from rtcore import cast
 from rtcore.cast import Part
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
 from rtcore.config import ConfigError, EnvConfig, RunConfig
+from rtcore.config_check import check
+from rtcore.tally import NAME_BYTES
 
 ALONE = RunConfig()
 FLEET = RunConfig(env=EnvConfig(count=3))
@@ -82,3 +84,18 @@ def test_a_process_plays_the_part_that_it_is_given(
 def test_a_part_that_there_is_not(config: RunConfig, role: str, index: int | None, text: str) -> None:
     with pytest.raises(ConfigError, match=f"^{text}"):
         cast.part_for(config, role, index)
+
+
+def test_a_fleets_names_fit_into_the_names_of_its_counters() -> None:
+    longest = "a" * 39
+    for name in (longest, f"{longest}12345"):  # of the number at its end another one takes the place
+        env = EnvConfig(name=name, count=10)
+        check(RunConfig(env=env))
+        assert {len(one) for one in cast.env_names(env)} == {40}
+        assert all(len(f"duplicate.{one}") < NAME_BYTES for one in cast.env_names(env))
+    for name, count, most in ((f"{longest}a", 2, 39), (longest, 11, 38)):
+        with pytest.raises(ConfigError) as caught:
+            check(RunConfig(env=EnvConfig(name=name, count=count)))
+        allowed = f"must be at most {most} characters, but for a number at its end, with env.count > 1"
+        assert str(caught.value) == f"env.name = {name!r}: {allowed}"
+    check(RunConfig(env=EnvConfig(name="a" * 64)))

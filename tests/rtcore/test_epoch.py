@@ -6,10 +6,12 @@ import threading
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from rtcore import epoch
 from rtcore.config import ConfigError
-from rtcore.epoch import Epoch, read, settle
+from rtcore.epoch import Epoch, agree, on_this_clock, read, settle
+from tests.rtcore.bus_samples import spec
 
 SECOND = 1_000_000_000
 FIRST = Epoch(t0_ns=100 * SECOND, wall_t0_ns=5_000 * SECOND, boot_id="one")
@@ -41,6 +43,27 @@ def test_after_a_reboot_it_is_converted_by_the_wall_clock(tmp_path: Path) -> Non
     assert found == Epoch(t0_ns=-120 * SECOND, wall_t0_ns=5_000 * SECOND, boot_id="two", lives=2)
     again, _ = settle(path, proposed(41, "two"), now_ns=40 * SECOND, wall_ns=6_000 * SECOND)
     assert (again.t0_ns, again.lives) == (-120 * SECOND, 3)
+
+
+def test_what_all_agree_on_is_converted_once(tmp_path: Path) -> None:
+    """As above: -120 s. The next to ask, whose wall clock was set by a second, finds the same."""
+    path = tmp_path / "epoch.json"
+    mine = proposed(7)
+    assert agree(path, FIRST, now_ns=1, wall_ns=2)[0] is FIRST
+    assert agree(path, mine, now_ns=1, wall_ns=2) == (FIRST, None)
+    for wall_s in (5_150, 5_151):
+        found, _ = agree(path, proposed(31, "two"), now_ns=30 * SECOND, wall_ns=wall_s * SECOND)
+        assert (found.t0_ns, found.boot_id, found.lives) == (-120 * SECOND, "two", 1)
+
+
+def test_a_declaration_of_another_host_is_read_by_the_wall_clock() -> None:
+    """T0 was at Unix time 5000 s, which is 150 s ago; here it is 30 s by the monotonic clock."""
+    declared = replace(spec(), t0_ns=100 * SECOND, wall_t0_ns=5_000 * SECOND, host="there")
+    now = {"now_ns": 30 * SECOND, "wall_ns": 5_150 * SECOND}
+    assert on_this_clock(declared, **now, boot_id="here") == replace(declared, t0_ns=-120 * SECOND)
+    assert on_this_clock(declared, **now, boot_id="there") is declared
+    virtual = replace(declared, host="")
+    assert on_this_clock(virtual, **now, boot_id="here") is virtual
 
 
 def test_of_those_who_come_at_once_one_sets_it(tmp_path: Path) -> None:

@@ -103,6 +103,24 @@ def test_another_hosts_clock_tells_nothing_of_the_future(rig: Rig) -> None:
     assert rig.read(make_step(0, tick=10**9)) == [(1, 0)]
 
 
+def test_the_world_is_what_the_caller_expects_whoever_declared_itself_first(rig: Rig) -> None:
+    foreign = replace(SPEC, incarnation=7, tick_ns=1)
+    rig.specs.put(foreign)
+    assert rig.read(make_step(0, incarnation=7)) == [(7, 0)]
+    rig.specs.put(SPEC)
+    rig.read()
+    assert rig.bus.rejected() == {"spec": 1}
+    other = Rig()
+    other.specs.put(foreign)
+    other.read()
+    other.reader.expect(SPEC)
+    other.specs.put(SPEC)
+    assert other.read(make_step(0)) == [(1, 0)]
+    other.specs.put(foreign)
+    other.read()
+    assert other.bus.rejected() == {"spec": 2}
+
+
 def test_declarations_are_bounded_and_the_first_one_stays(rig: Rig) -> None:
     rig.specs.put(SPEC)
     for incarnation in range(2, 400):

@@ -14,9 +14,10 @@ from rtcore import channels, process, realtime
 from rtcore.bus import BusError
 from rtcore.clock import VirtualClock
 from rtcore.config import EnvConfig, RunConfig
-from rtcore.ledger import Ledger
+from rtcore.ledger import Ledger, brief
 from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
+from rtcore.messages import EpisodeReturn
 from rtcore.process import Reporter, _ledger, background
 from rtcore.run_dir import RunDir
 
@@ -99,6 +100,21 @@ def test_what_was_rejected_is_counted_by_channel() -> None:
     assert queue.drain() == []
     last = Reporter(ledger, bus, clock, channels.LEARNER).snapshot()
     assert last.counters == {"messages.rejected": 1, "messages.rejected.log": 1}
+
+
+def test_last_words_of_a_long_life_fit_into_a_message() -> None:
+    clock, hub = VirtualClock(5), MemoryHub()
+    bus, ledger = hub.bus(channels.ENV_SERVER, clock), Ledger(channels.ENV_SERVER, 1)
+    stats = hub.bus(channels.RECORDER, clock).queue(channels.STATS, "*")
+    for number in range(60_000):
+        ledger.episode(EpisodeReturn(episode=number, at_ns=1 << 55, value=1.5, length=1000))
+    reporter = Reporter(ledger, bus, clock, channels.ENV_SERVER)
+    last = reporter.snapshot(final=True)
+    assert len(last.returns) == 60_000
+    reporter.publish(brief(last))
+    (received,) = stats.drain()
+    assert received.message.final and received.message.returns[-1].episode == 59_999
+    assert ledger.counter("stats.unsent") == 0
 
 
 def test_a_killed_process_leaves_its_counters_and_the_next_life_a_greater_number(tmp_path: Path) -> None:

@@ -254,6 +254,15 @@ def test_pairs_of_a_fleet_are_dealt_to_its_cores_and_the_others_keep_off() -> No
     assert plan("recorder", "auto", (0, 1), ALL, Crew(0, 4, 500.0)).cores == (0, 1)
 
 
+def test_who_watches_a_fleet_keeps_off_all_of_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    pinned: list[tuple[int, ...]] = []
+    monkeypatch.setattr(realtime, "allowed_cores", lambda: (0, 1, 2, 3))
+    monkeypatch.setattr(realtime, "pin", lambda cores: pinned.append(tuple(cores)))
+    with realtime.out_of_the_way("auto", Crew(0, 4, 500.0)):
+        assert pinned == [(2, 3)]
+    assert pinned == [(2, 3), (0, 1, 2, 3)]
+
+
 def test_off_changes_neither_cores_nor_scheduler() -> None:
     (placed,) = in_process('show(realtime.enter("agent_service", "off"))')
     assert placed["cores"] == sorted(os.sched_getaffinity(0))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import stat
 import tempfile
@@ -111,6 +112,15 @@ def test_stale_sockets_go_and_strangers_stay(far: RunDir) -> None:
     far.remove_socket_dir()
     assert not directory.exists()
     far.remove_socket_dir()
+
+
+def test_what_an_earlier_run_at_the_same_path_left_is_gone(far: RunDir) -> None:
+    directory = far.socket_dir()
+    for name in ("ports.json", "env_server.sock"):
+        (directory / name).touch()
+    shutil.rmtree(far.path)  # by hand, after it crashed
+    again = RunDir.create(far.path, CONFIG)
+    assert again.socket_dir() == directory and list(directory.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["one", "x" * 100])

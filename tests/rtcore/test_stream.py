@@ -74,6 +74,17 @@ def test_what_comes_after_it_was_given_up_is_late() -> None:
     assert counts(stream) == {"received": 6, "delivered": 2, "gaps": 2, "late": 2, "duplicate": 2}
 
 
+def test_late_and_duplicate_are_told_apart_between_gaps() -> None:
+    stream = StepStream()
+    for numbers in ((0, 1), (4, 5), (9,)):  # 2, 3 and 6, 7, 8 are given up
+        stream.feed(batch(*numbers))
+        stream.give_up()
+    assert stream.gaps == 5
+    for seq, late, duplicate in ((1, 0, 1), (2, 1, 1), (3, 2, 1), (4, 2, 2), (5, 2, 3), (8, 3, 3), (9, 3, 4)):
+        stream.feed(batch(seq))
+        assert (stream.late, stream.duplicate) == (late, duplicate), seq
+
+
 def test_flush_gives_up_every_gap() -> None:
     stream = StepStream()
     stream.feed(batch(1, 4, 5, 8))
