@@ -4,7 +4,8 @@
 
 The two policies live through the run's own timetable: the same episodes' lengths at the same units, so
 at the same targets. Only the initial noise of the episodes differs. Returns are per tick; for worlds
-whose episodes all have the same length.
+whose episodes all have the same length, and for runs of one environment: a fleet's returns are told
+environment by environment, which is no course of time.
 """
 
 from __future__ import annotations
@@ -84,6 +85,8 @@ def compare(path: Path) -> dict[str, Any]:
     """The table of one run."""
     run_dir = RunDir.open(path)
     config = run_dir.config()
+    if config.env.count > 1:
+        raise SystemExit(f"{path}: {config.env.count} environments; needs a run of one")
     summary = json.loads(run_dir.summary_path.read_text())
     ticks = summary["ticks"] + summary["deadlines"]["skipped"]
     learned = [value / config.env.episode_steps for value in summary["returns"]]

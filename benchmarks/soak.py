@@ -16,8 +16,8 @@ or if the last block has `LIMIT_SHARE` more than the first one. It is flat if ne
 itself is above. Else the run was too short to tell, and so is one whose second half begins in the warm-up,
 where caches fill.
 
-The exit code is 1 if a process grows, or if anything was lost, dropped, rejected or started again, or if a
-count does not reconcile. Missed and skipped deadlines are told; they are the machine's.
+The exit code is 1 if a process grows, if anything was lost, dropped, rejected, not on disk or restarted, or
+if a count does not reconcile. Missed and skipped deadlines are told; they are the machine's.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import ROOT, BenchmarkError, world, write_result
 from benchmarks.memory import Sample, Sampler
+from env_server.worlds.period import num_ticks
 from launcher.stealing import StealMeter
 from launcher.summary import Summary, discrepancies
 from rtcore import cast, epoch
@@ -55,7 +56,7 @@ WARM_UP_S = 300.0  # the logs' caches keep 100 s and Zenoh's and the allocators'
 BLOCKS = 10
 LIMIT_MB_H = 4.0  # 100 MB in a day
 LIMIT_SHARE = 0.03  # in a half of 15 minutes 1 MB of an env server's 32, 5 MB of a learner's 170
-EPISODE_STEPS = 1000  # 2 s at 500 Hz: the launcher keeps every return of the run, some 360 bytes each
+EPISODE_STEPS = 1000  # 2 s at 500 Hz: the launcher keeps every return of the run, 16 bytes each
 END_LIMIT_S = 120.0  # beyond the duration: 15 s for the start, 20 s for the end, and a busy machine
 Floats = NDArray[np.float64]
 Verdict = Literal["flat", "grows", "too short"]
@@ -171,13 +172,13 @@ def accounts(summary: Summary) -> dict[str, dict[str, Any]]:
 def problems(summary: Summary, num_ticks: int) -> list[str]:
     """What was lost, dropped, rejected or started again, and what does not reconcile."""
     found = discrepancies(summary)
-    if summary["ended"] != "duration":
-        found.append(f"ended: {summary['ended']}")
+    found += [f"ended: {summary['ended']}"] if summary["ended"] != "duration" else []
     for env, row in accounts(summary).items():
         found += [f"{env}: {name} {row[name]}" for name in ("lost", "down") if row[name]]
         if (passed := row["ticks"] + row["skipped"] + row["down"]) != num_ticks:
             found.append(f"{env}: {passed} of {num_ticks} deadlines")
     counted = {"recorder dropped": summary["recorder"]["dropped"]}
+    counted |= {f"not on disk, {name}": count for name, count in summary["disk"].items()}
     counted |= {f"messages {name}": summary["messages"][name] for name in ("rejected", "denied")}
     counted |= {f"restarts of {process}": count for process, count in summary["restarts"].items()}
     counted |= {"killed at the end": len(summary["forced"])}
@@ -234,9 +235,8 @@ def soak(config: RunConfig, path: Path) -> dict[str, Any]:
 
 def judged(config: RunConfig, found: dict[str, Any]) -> dict[str, Any]:
     """The result: memory by process, accounts by environment, and what is wrong."""
-    assert config.env.hz is not None
     summary, samples, t0_s = found["summary"], found.pop("samples"), found.pop("t0_s")
-    wrong = problems(summary, round(config.duration_s * config.env.hz))
+    wrong = problems(summary, num_ticks(config.env, config.duration_s))
     wrong += [f"tenuto run ended with code {found['code']}"] if found["code"] else []
     memory = {}
     for name in ("launcher", *cast.names(config)):

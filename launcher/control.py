@@ -108,19 +108,31 @@ def stop(argv: Sequence[str]) -> int:
 
 
 def _order(run_dir: RunDir, verb: Verb, role: str, wanted: ScheduleConfig | None = None) -> int:
-    """Give an order to all processes of a role. One that does not answer keeps no other from its own."""
+    """Give an order to all processes of a role. One that does not answer keeps no other from its own; nor is
+    it a failure, if it is not there and another one is.
+    """
     failures: list[CommandError] = []
+    absent: list[str] = []
+    processes = cast.of_role(run_dir.config(), role)
     with _joined(run_dir) as bus:
-        for process in cast.of_role(run_dir.config(), role):
+        for process in processes:
             try:
                 reply = _ask(bus, process, verb, wanted)
             except NoAnswerError:
-                failures.append(_silence(run_dir, process))
+                if process in bus.alive():
+                    failures.append(_silence(run_dir, process))
+                else:
+                    absent.append(process)
                 continue
             if reply.ok:
-                Console().print(f"{process}: {reply.text}", highlight=False, soft_wrap=True)
+                _say(f"{process}: {reply.text}")
             else:
                 failures.append(CommandError(f"{process}: {reply.text}"))
+    if len(absent) == len(processes):
+        failures = [_silence(run_dir, process) for process in absent]
+        absent = []
+    for process in absent:
+        _say(f"{process}: is not there: it has ended, or is between two lives; then {verb} again")
     if failures:
         raise CommandError("; ".join(map(str, failures)))
     return DONE
@@ -161,6 +173,10 @@ def _joined(run_dir: RunDir) -> Iterator[Bus]:
 
 def _ask(bus: Bus, process: str, verb: Verb, wanted: ScheduleConfig | None = None) -> CommandReply:
     return bus.ask(process, Command(id=uuid.uuid4().hex, verb=verb, schedule=wanted), timeout_s=1.0, tries=3)
+
+
+def _say(text: str) -> None:
+    Console().print(text, highlight=False, soft_wrap=True)
 
 
 def _silence(run_dir: RunDir, process: str = "") -> CommandError:

@@ -63,8 +63,16 @@ class Lookout:
             self._watch.feed(received.message, received.received_ns)
             self.vitals.heard(received.message, received.received_ns)
         if self._viewer.due and self._watch.heard(channels.RECORDER):
-            self._viewer.open()
-            self._screen.say(f"view {self._viewer.address}")
+            self._open_view()
         if waiting_for:
             self._screen.note = "ending: " + ", ".join(by_role(waiting_for))
         self._screen.update()
+
+    def _open_view(self) -> None:
+        """Nobody's run ends for want of a view."""
+        try:
+            self._viewer.open()
+        except OSError as error:
+            self._screen.say(f"no view: {error}")
+        else:
+            self._screen.say(f"view {self._viewer.address}")

@@ -59,6 +59,7 @@ class Now:
         env: those of all environments together.
         agent: of all agents.
         learner: the learner's.
+        not_on_disk: what no process's disk took, of every kind.
     """
 
     run_time_s: float
@@ -72,6 +73,7 @@ class Now:
     env: Totals
     agent: Totals
     learner: Totals
+    not_on_disk: int
 
     @property
     def last_return(self) -> float | None:

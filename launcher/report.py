@@ -207,6 +207,9 @@ def _accounts(summary: Summary) -> RenderableType:
             f"{summary['messages']['rejected']:,} messages rejected",
         ),
     ]
+    if lacking := {name: count for name, count in summary.get("disk", {}).items() if count}:
+        text = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in lacking.items())
+        rows.append(("not on disk", Text(text, style="red")))
     found = discrepancies(summary)
     if foreign := summary["policies"].get("foreign", 0):
         rows.append(("refused", Text(f"{foreign:,} policies that are not the learner's", style="red")))

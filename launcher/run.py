@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from env_server.worlds.period import num_ticks
 from launcher import options, regret, report
 from launcher.cli import DONE, FAILED, INTERRUPTED, CommandError
 from launcher.herald import logged
@@ -19,6 +20,7 @@ from launcher.lookout import Lookout
 from launcher.mending import mend
 from launcher.restarts import Happening, Restarts
 from launcher.screen import Screen
+from launcher.streams import dispensable
 from launcher.summary import Summary, passed, summarise
 from launcher.supervisor import End, Interrupts, Supervisor, command_for
 from launcher.viewer import Viewer
@@ -28,6 +30,7 @@ from rtcore import cast, channels, epoch, realtime
 from rtcore.bus import BusError
 from rtcore.cast import role_of
 from rtcore.config import ConfigError, RunConfig
+from rtcore.crew import Crew
 from rtcore.files import write_atomic
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir, default_run_path
@@ -44,21 +47,48 @@ def run(argv: Sequence[str]) -> int:
     config, chosen = options.read(options.RunOptions, argv, prog="tenuto run", description=description)
     options.require_keys(config.link, (*dict.fromkeys(map(role_of, _wanted(config))), OPERATOR))
     run_dir = RunDir.create(chosen.run_dir or default_path(config), config)
-    clock, console = MonotonicClock(), Console()
+    with dispensable():
+        return _run(config, run_dir)
+
+
+def default_path(config: RunConfig) -> Path:
+    """Where a run goes that names no directory."""
+    return default_run_path(RUNS, config.preset, datetime.now(UTC))
+
+
+def _run(config: RunConfig, run_dir: RunDir) -> int:
+    """From the start of its processes to the report. Until the summary is written, an interrupt counts and
+    does no more.
+    """
+    console, interrupts = Console(), Interrupts()
     console.print(f"run  {run_dir.path}", highlight=False, soft_wrap=True)
-    watch = Watch(config.env.hz or 1.0)
+    with interrupts.counted():
+        end, summary = _lived(config, run_dir, console, interrupts)
+        if end.reason == "killed":
+            sys.stderr.write(f"tenuto: killed; what lies in {run_dir.path} may be incomplete\n")
+            return INTERRUPTED
+        kept = keep_summary(summary, run_dir)
+    console.print(report.render(summary, run_dir))
+    _complain(end, run_dir)
+    return DONE if kept and not end.failures and not end.forced else FAILED
+
+
+def _lived(
+    config: RunConfig, run_dir: RunDir, console: Console, interrupts: Interrupts
+) -> tuple[End, Summary]:
+    """How the run ended, and its summary; an empty one, if it was killed."""
+    clock, watch = MonotonicClock(), Watch(config.env.hz or 1.0)
     screen = Screen(console, config, run_dir.run_name, watch, clock)
     began_ns = clock.now_ns()
     try:
-        end = _carry_out(config, run_dir, watch, screen, clock)
+        end = _carry_out(config, run_dir, watch, screen, clock, interrupts)
     except (BusError, OSError) as error:
         run_dir.remove_if_empty()
         raise CommandError(str(error)) from error
     wall_s = (clock.now_ns() - began_ns) / 1e9
     run_dir.remove_socket_dir()
     if end.reason == "killed":
-        sys.stderr.write(f"tenuto: killed; what lies in {run_dir.path} may be incomplete\n")
-        return INTERRUPTED
+        return end, {}
     watch.feed_final(run_dir.read_final_stats())
     summary = summarise(
         config,
@@ -70,27 +100,15 @@ def run(argv: Sequence[str]) -> int:
         forced=end.forced,
     )
     summary["supervision"] = _told(watch.happenings, run_dir, began_ns)
-    summary |= regret.of_run(config, run_dir)
-    kept = _keep(summary, run_dir)
-    console.print(report.render(summary, run_dir))
-    _complain(end, run_dir)
-    return DONE if kept and not end.failures and not end.forced else FAILED
+    impatient = interrupts.count > 1  # it takes a second, and more on a busy machine
+    lost = {"regret": None, "regret_missing": "interrupted"} if impatient else regret.of_run(config, run_dir)
+    return end, summary | lost
 
 
-def default_path(config: RunConfig) -> Path:
-    """Where a run goes that names no directory."""
-    return default_run_path(RUNS, config.preset, datetime.now(UTC))
-
-
-def write_summary(run_dir: RunDir, summary: Summary) -> None:
-    """Write summary.json whole."""
-    write_atomic(run_dir.summary_path, (json.dumps(summary, indent=2) + "\n").encode())
-
-
-def _keep(summary: Summary, run_dir: RunDir) -> bool:
-    """Write summary.json, or say why not: the report is printed all the same."""
+def keep_summary(summary: Summary, run_dir: RunDir) -> bool:
+    """Write summary.json whole, or say why not: the report is printed all the same."""
     try:
-        write_summary(run_dir, summary)
+        write_atomic(run_dir.summary_path, (json.dumps(summary, indent=2) + "\n").encode())
     except OSError as error:
         sys.stderr.write(f"tenuto: {run_dir.summary_path} is not written: {error.strerror or error}\n")
         return False
@@ -103,10 +121,16 @@ def _wanted(config: RunConfig) -> tuple[str, ...]:
 
 
 def _carry_out(
-    config: RunConfig, run_dir: RunDir, watch: Watch, screen: Screen, clock: MonotonicClock
+    config: RunConfig,
+    run_dir: RunDir,
+    watch: Watch,
+    screen: Screen,
+    clock: MonotonicClock,
+    interrupts: Interrupts,
 ) -> End:
     """Start the processes, watch over them, end them."""
-    interrupts, wanted = Interrupts(), _wanted(config)
+    wanted = _wanted(config)
+    crew = Crew(0, config.env.count, config.env.hz or 0.0)
     viewer = Viewer(config.recorder, run_dir.logs_dir / "viewer.out")
     lookout = Lookout(watch, Vitals(config.supervise.stuck_s), screen, viewer, clock)
     supervisor = Supervisor(
@@ -116,29 +140,28 @@ def _carry_out(
         vitals=lookout.vitals,
         tell=lookout.happened,
     )
-    with interrupts.counted():
-        with supervisor.started():
-            os.nice(NICENESS)
-            with (
-                realtime.out_of_the_way(config.agent.rt),
-                logged(run_dir.log_path(channels.LAUNCHER)),
-                open_bus(
-                    "client",
-                    run_dir.run_name,
-                    run_dir.socket_dir(),
-                    clock=clock,
-                    peers=cast.names(config),
-                    secure=config.link.secure,
-                ) as bus,
-                closing(viewer),
-                screen.shown(),
-            ):
-                lookout.join(bus)
-                end = supervisor.supervise(interrupts, lookout.look)
-                lookout.look(frozenset())  # the last messages
-        unfinished = channels.RECORDER in wanted and not supervisor.ended_well(channels.RECORDER)
-        if unfinished and end.reason != "killed":
-            mend(run_dir.recording_path, interrupts)
+    with supervisor.started():
+        os.nice(NICENESS)
+        with (
+            realtime.out_of_the_way(config.agent.rt, crew),
+            logged(run_dir.log_path(channels.LAUNCHER)),
+            open_bus(
+                "client",
+                run_dir.run_name,
+                run_dir.socket_dir(),
+                clock=clock,
+                peers=cast.names(config),
+                secure=config.link.secure,
+            ) as bus,
+            closing(viewer),
+            screen.shown(),
+        ):
+            lookout.join(bus)
+            end = supervisor.supervise(interrupts, lookout.look)
+            lookout.look(frozenset())  # the last messages
+    unfinished = channels.RECORDER in wanted and not supervisor.ended_well(channels.RECORDER)
+    if unfinished and end.reason != "killed":
+        mend(run_dir.recording_path, interrupts)
     return end
 
 
@@ -161,9 +184,9 @@ def _why(end: End, config: RunConfig, watch: Watch) -> str:
         return "; ".join(str(failure) for failure in end.failures)
     if end.reason == "interrupted":
         return "interrupted"
-    whole = int(config.duration_s * (config.env.hz or 1.0))
+    whole = num_ticks(config.env, config.duration_s)
     servers = cast.of_role(config, channels.ENV_SERVER)
-    reached = config.duration_s > 0 and all(passed(watch.totals(name)) >= whole for name in servers)
+    reached = whole > 0 and all(passed(watch.totals(name)) >= whole for name in servers)
     return "duration" if reached else "stopped"
 
 

@@ -9,9 +9,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from launcher import options, regret, report
-from launcher.cli import DONE
+from launcher.cli import DONE, FAILED
 from launcher.drawing import clock
-from launcher.run import default_path, write_summary
+from launcher.run import default_path, keep_summary
+from launcher.streams import dispensable
 from launcher.summary import summarise
 from rtcore.config import ConfigError, RunConfig
 from rtcore.lifecycle import Stop, stop_on_signals
@@ -25,6 +26,12 @@ def run_sim(argv: Sequence[str]) -> int:
     if config.duration_s == 0:
         raise ConfigError("duration_s", 0, "must be above 0 in virtual time")
     run_dir = RunDir.create(chosen.run_dir or default_path(config), config)
+    with dispensable():
+        return _run(config, run_dir)
+
+
+def _run(config: RunConfig, run_dir: RunDir) -> int:
+    """To the report."""
     from launcher.sim import simulate  # with it comes all that is heavy: only now
 
     console, stop = Console(), Stop()
@@ -41,9 +48,9 @@ def run_sim(argv: Sequence[str]) -> int:
         clock="virtual",
     )
     summary |= regret.of_run(config, run_dir)
-    write_summary(run_dir, summary)
+    kept = keep_summary(summary, run_dir)
     console.print(report.render(summary, run_dir))
-    return DONE
+    return DONE if kept else FAILED
 
 
 @contextmanager

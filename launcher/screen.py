@@ -17,7 +17,7 @@ from rich.text import Text
 from launcher import drawing, fleet_screen, panes
 from launcher.drawing import LABEL
 from launcher.panes import WIDTH, WORK, Now
-from launcher.summary import passed
+from launcher.summary import not_on_disk, passed
 from launcher.totals import together
 from launcher.watch import Watch
 from rtcore import cast, channels
@@ -96,6 +96,8 @@ class Screen:
         troubled = [f"{name} {state}" for name, state in now.states.items() if state != "alive"]
         if restarts := self._watch.restarts.total():
             troubled.append(f"restarts {restarts}")
+        if now.not_on_disk:
+            troubled.append(f"not on disk {now.not_on_disk}")
         return "  ".join(parts + troubled + ([self.note] if self.note else []))
 
     def render(self) -> RenderableType:
@@ -139,6 +141,8 @@ class Screen:
         watch = self._watch
         envs = [watch.totals(name) for name in self._servers]
         agents = [watch.totals(name) for name in self._agents]
+        env, agent, learner = together(envs), together(agents), watch.totals(channels.LEARNER)
+        lacking = not_on_disk([env, agent, learner, watch.totals(channels.RECORDER)])
         run_time_s = max(map(passed, envs)) / (self._config.env.hz or 1.0)
         return Now(
             run_time_s=run_time_s,
@@ -149,9 +153,10 @@ class Screen:
             restarts=watch.restarts,
             envs=envs,
             agents=agents,
-            env=together(envs),
-            agent=together(agents),
-            learner=watch.totals(channels.LEARNER),
+            env=env,
+            agent=agent,
+            learner=learner,
+            not_on_disk=sum(lacking.values()),
         )
 
     def _state(self, process: str) -> str:

@@ -18,6 +18,15 @@ from rtcore.messages import CAUSES, Stats, WindowNotice
 
 SCHEMA = 1
 REJECTED = "messages.rejected."  # begins the counters of each channel
+NOT_ON_DISK = {
+    "transitions": "replay.unbacked",  # in memory alone: gone with the learner
+    "checkpoints": "checkpoint.errors",
+    "diary_entries": "diary.errors",
+    "policies": "policy_file.errors",
+    "schedules": "schedule_file.errors",
+    "tallies": "tally.unbacked",  # lives whose counters die with them
+    "rows": "disk_dropped",  # of the recording
+}
 PASSED = ("ticks", "skipped", "down")  # every deadline from T0 on is one of them
 
 Summary = dict[str, Any]
@@ -75,10 +84,11 @@ def summarise(
         "transitions": _transitions(env, learner),
         "learner": _learner(learner, run_time_s),
         "forecast": _forecast(learner.gauges),
-        "recorder": {"rows": recorder.counters["rows"], "dropped": recorder.counters["dropped"]},
+        "recorder": {name: recorder.counters[name] for name in ("rows", "dropped", "live_dropped")},
         "restarts": {role: sum(restarts.get(name, 0) for name in of_role[role]) for role in PROCESSES},
         "supervision": [],
         "messages": _messages(totals.values()),
+        "disk": not_on_disk(totals.values()),
     }
     if config.env.count == 1:
         return found
@@ -88,9 +98,16 @@ def summarise(
 
 def _messages(totals: Collection[Totals]) -> Summary:
     """What came and was not taken: `rejected` for what it was, also by channel, `denied` for whom it was
-    from, by access control; and the links that secured processes refused.
+    from, by access control; and the links that secured processes refused. What was to be told and was not:
+    whole ledgers, `unsent`, which the next one made good, and lines of the timeline, which the log has.
     """
-    counted = {"rejected": "messages.rejected", "denied": "link.denied", "links_refused": "link.refused"}
+    counted = {
+        "rejected": "messages.rejected",
+        "denied": "link.denied",
+        "links_refused": "link.refused",
+        "unsent": "stats.unsent",
+        "events_dropped": "events.dropped",
+    }
     found: Summary = {
         name: sum(total.counters[counter] for total in totals) for name, counter in counted.items()
     }
@@ -100,6 +117,11 @@ def _messages(totals: Collection[Totals]) -> Summary:
             if name.startswith(REJECTED):
                 by_channel[name.removeprefix(REJECTED)] += count
     return found | {"by_channel": dict(sorted(by_channel.items()))}
+
+
+def not_on_disk(totals: Collection[Totals]) -> Summary:
+    """What the disk did not take, by name; all 0 where it took everything."""
+    return {field: sum(total.counters[counter] for total in totals) for field, counter in NOT_ON_DISK.items()}
 
 
 def _about(config: RunConfig, run: str) -> Summary:

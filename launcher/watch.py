@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from array import array
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 
 import msgspec
 
@@ -23,20 +25,48 @@ MAX_LIVES = 1000  # of all processes: more are a stranger's; and so many histogr
 RETURNS_SHOWN = 60
 
 
-@dataclass
 class _Incarnation:
-    """One life of one process."""
+    """One life of one process.
 
-    newest: Stats
-    returns: dict[int, EpisodeReturn] = field(
-        default_factory=dict
-    )  # by episode: each message has the last 64
+    A message has the newest 64 returns, and all that were ever seen are kept: number and value of each, 16
+    bytes. A screen reads four times a second and must not take the longer the more there are.
+    """
+
+    def __init__(self, newest: Stats) -> None:
+        self.newest = newest
+        self._episodes, self._values = array("q"), array("d")  # in the order of the episodes
+        self._best = -math.inf
+        self.learn(newest.returns)
+
+    def learn(self, returns: Iterable[EpisodeReturn]) -> None:
+        """Take in returns; those that are known already change nothing."""
+        for one in returns:
+            at = bisect_left(self._episodes, one.episode)
+            if at == len(self._episodes) or self._episodes[at] != one.episode:
+                self._episodes.insert(at, one.episode)
+                self._values.insert(at, one.value)
+                self._best = max(self._best, one.value)
 
     def whole(self) -> Stats:
         """The newest ledger with all returns that were ever seen."""
-        return msgspec.structs.replace(
-            self.newest, returns=[self.returns[episode] for episode in sorted(self.returns)]
-        )
+        return msgspec.structs.replace(self.newest, returns=self._listed(0))
+
+    def shown(self) -> Stats:
+        """The newest ledger with the returns that a screen needs: the newest 60, before them the best."""
+        first = max(0, len(self._episodes) - RETURNS_SHOWN)
+        returns = self._listed(first)
+        if first:
+            returns.insert(0, _episode(self._episodes[first - 1], self._best))
+        return msgspec.structs.replace(self.newest, returns=returns)
+
+    def _listed(self, first: int) -> list[EpisodeReturn]:
+        pairs = zip(self._episodes[first:], self._values[first:], strict=True)
+        return [_episode(number, value) for number, value in pairs]
+
+
+def _episode(number: int, value: float) -> EpisodeReturn:
+    """A return without its time and length, which nobody asks the launcher for."""
+    return EpisodeReturn(episode=number, at_ns=0, value=value, length=0)
 
 
 class Watch:
@@ -71,7 +101,7 @@ class Watch:
         life = self._lives.setdefault(key, _Incarnation(stats))
         if stats.seq >= life.newest.seq:
             life.newest = stats
-        life.returns.update({one.episode: one for one in stats.returns})
+        life.learn(stats.returns)
         self.events.extend(self._news(stats))  # they come repeatedly, oldest first
         self._seen_ns[stats.process] = received_ns
         recent = self._recent.setdefault(stats.process, deque())
@@ -110,9 +140,7 @@ class Watch:
                 counters = raised(heard.newest.counters, one.counters)
                 heard.newest = msgspec.structs.replace(heard.newest, counters=counters)
                 continue
-            self._lives[(one.process, one.incarnation)] = _Incarnation(
-                one, {episode.episode: episode for episode in one.returns}
-            )
+            self._lives[(one.process, one.incarnation)] = _Incarnation(one)
 
     def stats(self) -> StatsByProcess:
         """The newest ledger of each incarnation, for the summary."""
@@ -122,11 +150,13 @@ class Watch:
         return found
 
     def totals(self, name: str) -> Totals:
-        """The ledgers of a process, or of all processes of a role, added up; empty before a first message."""
+        """The ledgers of a process, or of all processes of a role, added up; empty before a first message. Of
+        each life's returns there are the newest 60 and, before them, the best.
+        """
         lives: dict[str, list[Stats]] = {}
         for (process, _), life in self._lives.items():
             if name in (process, role_of(process)):
-                lives.setdefault(process, []).append(life.whole())
+                lives.setdefault(process, []).append(life.shown())
         in_order = sorted(lives, key=lambda process: index_of(process) or 0)
         return together(add_up(lives[process]) for process in in_order)
 

@@ -178,7 +178,7 @@ def _started(config: RunConfig, path: Path) -> Iterator[subprocess.Popen[bytes]]
         file.write(dump_toml(config).encode())
         file.flush()
         command = [sys.executable, "-m", "launcher", "run", "--config", file.name, "--run-dir", str(path)]
-        # In a process group of its own: a Ctrl-C is ours, and we pass it on once.
+        # In a process group of its own: a Ctrl-C is ours, and we pass on the first two.
         child = subprocess.Popen(command, process_group=0, stdin=subprocess.DEVNULL)
         try:
             yield child
@@ -189,13 +189,16 @@ def _started(config: RunConfig, path: Path) -> Iterator[subprocess.Popen[bytes]]
 
 
 def _ended(child: subprocess.Popen[bytes], interrupts: Interrupts) -> int | None:
-    """Its exit code once it has ended, which an interrupt asks for; None: it did not."""
-    if interrupts.count and child.poll() is None:
-        os.kill(child.pid, signal.SIGINT)
-    try:
-        return child.wait(END_LIMIT_S)
-    except subprocess.TimeoutExpired:
-        return None
+    """Its exit code once it has ended, which an interrupt asks for, and a second one at once; None: it did
+    not.
+    """
+    limit_s, passed_on = time.monotonic() + END_LIMIT_S, 0
+    while (code := child.poll()) is None and time.monotonic() < limit_s:
+        if passed_on < min(interrupts.count, 2):
+            passed_on += 1
+            child.send_signal(signal.SIGINT)
+        time.sleep(POLL_S)
+    return code
 
 
 def _beginning_ns(run_dir: RunDir, going_on: Callable[[], bool]) -> int | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from env_server.worlds.period import num_ticks
 from launcher.chaos.faults import Done
 from launcher.report import load
 from launcher.summary import Summary
@@ -25,7 +26,10 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 SHARED = ("published", "last_version")  # counters of the learner that are of every environment
-REFUSED = re.compile(r"policy (\d+) refused")
+# What the agent says of a version that must not act. Two kinds of refusal say nothing against it: it is older
+# than what was there before, and may have acted then; what came by its number is not what the learner sent.
+NOT_OF_THE_VERSION = r"version \d+ was there before|it is not signed|its signature|sha256 differs"
+REFUSED = re.compile(rf"policy (\d+) refused: (?!{NOT_OF_THE_VERSION})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +71,7 @@ class Evidence:
         summary: summary.json; None: there is none.
         lives: of each process, by name, oldest first.
         recorded: the recording; of a fleet what its environments share.
-        refused: versions that the agent refused.
+        refused: versions that the agent refused for what was in them.
         kept: transitions that the learner's replay says were ever added to it; None: nobody can tell.
         env: whose evidence it is; empty: that of the run.
         fleet: of each environment; empty: there is one, and this is its.
@@ -101,7 +105,7 @@ class Evidence:
             index: of the environment.
             env: its name.
             recorded: the recording of it.
-            refused: versions that its agent refused.
+            refused: versions that its agent refused for what was in them.
         """
         own = {Part(role, index).name: role for role in PER_ENV}
         lives = {role: self.lives.get(name, ()) for name, role in own.items()}
@@ -155,7 +159,7 @@ def gather(run_dir: RunDir, done: Sequence[Done], *, ended: bool) -> Evidence:
         done=done,
         ended=ended,
         tick_s=1 / config.env.hz,
-        num_ticks=round(config.duration_s * config.env.hz) if config.duration_s else None,
+        num_ticks=num_ticks(config.env, config.duration_s) or None,
         summary=summary,
         lives=lives,
         recorded=recorded[0],
@@ -193,7 +197,7 @@ def read_recording(path: Path, prefix: str = "") -> Recorded:
 
 
 def refused(log: Path) -> frozenset[int]:
-    """Versions that the agent's log says it refused."""
+    """Versions that the agent's log says it refused for what was in them."""
     found = set()
     with suppress(OSError):
         for line in log.read_text(errors="replace").splitlines():

@@ -147,11 +147,16 @@ def policies(evidence: Evidence) -> Clause:
         (life.counters.get("last_version", 0) for life in evidence.lives.get(LEARNER, ())), default=0
     )
     bad, unknown = sorted(acted & evidence.refused), sorted(one for one in acted if one > newest)
-    adopted, rejected = (evidence.total(AGENT, f"policies.{fate}") for fate in ("adopted", "rejected"))
-    text = f"{adopted} adopted, {rejected} refused"
+    adopted, rejected, foreign = (
+        evidence.total(AGENT, f"policies.{fate}") for fate in ("adopted", "rejected", "foreign")
+    )
+    text = f"{adopted} adopted, {rejected} refused, {foreign} foreign"
     if bad or unknown:
         text += f"; acted though refused: {bad or 'none'}, though never published: {unknown or 'none'}"
-    numbers = {"adopted": adopted, "rejected": rejected, "refused_acted": bad, "unknown_acted": unknown}
+    numbers = {
+        "adopted": adopted, "rejected": rejected, "foreign": foreign, "refused_acted": bad,
+        "unknown_acted": unknown,
+    }  # fmt: skip
     return Clause("policies", not bad and not unknown, text, numbers)
 
 

@@ -129,7 +129,11 @@ def plan(options: LatencyOptions) -> Plan:
     default = tuple(map(float, LADDER_HZ)) if options.hold_rate else RATES_HZ
     rates = default if options.hz is None else parse_rates(options.hz)
     loads: tuple[Load, ...] = ("none", "learner") if options.load == "both" else (options.load,)
-    planned = Plan(options, presets.load(options.env), rates, loads)
+    base = presets.load(options.env)
+    if base.env.count > 1:  # what is measured is one pair of env server and agent
+        allowed = f"must be a preset of one environment: its env.count is {base.env.count}"
+        raise ConfigError("env", options.env, allowed)
+    planned = Plan(options, base, rates, loads)
     for hz in rates:
         planned.config(hz, loads[0], options.seconds)
     return planned

@@ -21,7 +21,8 @@ from launcher.plan.envelope import fit
 from launcher.report import load
 from learner.theory.mdp import discounted_index, discounted_steps
 from recorder.reading import columns
-from rtcore.config import ConfigError, RunConfig
+from rtcore.cast import env_names
+from rtcore.config import ConfigError, EnvConfig, RunConfig
 from rtcore.run_dir import RunDir
 
 Floats = NDArray[np.float64]
@@ -41,7 +42,7 @@ def from_run(path: Path, length: int | None = None) -> Estimate:
         windows = [(one["t_m"], one["G"], one["N"]) for one in summary["windows"] if one["N"] is not None]
     except (KeyError, TypeError) as error:
         raise ConfigError("run", str(path), f"its summary.json lacks {error}") from error
-    drift, reward = _recorded(run_dir)
+    drift, reward = _recorded(run_dir, config.env)
     ended = [window for window in windows if sum(window) < len(drift)]
     if not ended:
         raise ConfigError("run", str(path), "needs a window that ended while it was recorded")
@@ -91,18 +92,19 @@ def local_changes(config: RunConfig, drift: Floats, reward_range: float) -> tupl
     return steps, "b_r is exact: the reward holds -|k_f v - v_d(t)|, so b_r is the step of v_d", False
 
 
-def _recorded(run_dir: RunDir) -> tuple[Floats, Floats]:
-    """The drift in each unit from 0 on, and all rewards.
+def _recorded(run_dir: RunDir, env: EnvConfig) -> tuple[Floats, Floats]:
+    """The drift in each unit from 0 on, and all rewards; of a fleet, of its first environment: the drift is
+    the same in all.
 
     Raises:
         ConfigError: there is no recording, or it holds nothing or cannot be read.
     """
-    path = run_dir.recording_path
+    path, root = run_dir.recording_path, f"/{env_names(env)[0]}" if env.count > 1 else ""
     if not path.is_file():
         raise ConfigError("run", str(run_dir.path), "needs a recording.rrd in it")
     try:
-        units, drift = columns(path, "/env/drift", timeline="unit")
-        _, reward = columns(path, "/env/reward", timeline="unit")
+        units, drift = columns(path, f"{root}/env/drift", timeline="unit")
+        _, reward = columns(path, f"{root}/env/reward", timeline="unit")
     except RuntimeError as error:
         raise ConfigError("run", str(run_dir.path), f"its recording.rrd cannot be read: {error}") from error
     if not len(units) or not len(reward):
@@ -140,6 +142,8 @@ def _remarks(config: RunConfig, *, has_holds: bool, moved: bool) -> tuple[str, .
     remarks = [] if has_holds else ["the run never held: its holds are taken to begin with its windows"]
     if not moved:
         remarks.append("the reward did not change in any window: nothing speaks for a hold")
+    if config.env.count > 1:
+        remarks.append(f"what is recorded is of {env_names(config.env)[0]}, the first of {config.env.count}")
     if moving:
         remarks.append(f"the drift of {', '.join(moving)} is left out: its b_p is not known")
     return tuple(remarks)

@@ -31,6 +31,7 @@ def summary(**changes: Any) -> dict[str, Any]:
         "transitions": {"produced": 3976, "learned": 3976, "lost": 0, "duplicate": 0},
         "learner": {"gradient_steps": 30},
         "recorder": {"rows": 9000, "dropped": 0},
+        "disk": {"transitions": 0, "rows": 0},
         "messages": {"rejected": 0, "denied": 0},
         "restarts": {"env_server": 0, "learner": 0},
         "forced": [],
@@ -135,6 +136,7 @@ def test_a_run_of_one_environment_is_its_own_account() -> None:
         ({"recorder": {"rows": 1, "dropped": 2}}, "recorder dropped: 2"),
         ({"messages": {"rejected": 3, "denied": 0}}, "messages rejected: 3"),
         ({"messages": {"rejected": 0, "denied": 4}}, "messages denied: 4"),
+        ({"disk": {"transitions": 5, "rows": 0}}, "not on disk, transitions: 5"),
         ({"restarts": {"learner": 1}}, "restarts of learner: 1"),
         ({"forced": ["recorder"]}, "killed at the end: 1"),
         ({"ended": "stopped"}, "ended: stopped"),
@@ -164,6 +166,8 @@ def test_the_result_has_a_verdict_for_everybody(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(soak, "problems", lambda summary, num_ticks: [f"{num_ticks} deadlines"])
     told = judged(config, found())
     assert told["wrong"] == ["1800000 deadlines"]
+    # 3600 s / 526 316 ns = 6 839 997.3, as the env server counts; duration times rate is 6 840 000
+    assert judged(configure(Arguments(minutes=60.0, hz=1900.0)), found())["wrong"] == ["6839997 deadlines"]
     assert list(told["memory"]) == ["launcher", *cast.names(config)]
     assert {row["verdict"] for row in told["memory"].values()} == {"flat"}
     assert told["series"]["learner"][0] == [90.0, 100 * MB, 100 * MB]

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
+import json
+from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from agent_service.adoption import COMPLAINT_NS, Adoption, Past
+from launcher import keys
 from launcher.chaos.clause import Clause, passed
-from launcher.chaos.evidence import Evidence, Life, Recorded
+from launcher.chaos.evidence import Evidence, Life, Recorded, gather, refused
 from launcher.chaos.faults import Done
 from launcher.chaos.judge import judge
 from launcher.chaos.layout import lay_out, masks
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES
+from rtcore.config import EnvConfig, LinkConfig, RunConfig
+from rtcore.ledger import Ledger
+from rtcore.run_dir import RunDir
+from rtcore.signing import open_signer, open_verifier
+from tests.agent_service.rig import SPEC, policy
 from tests.launcher.chaos_runs import (
     FIRST,
     KILLED,
@@ -137,6 +148,48 @@ def test_what_acts_was_checked() -> None:
     assert verdict("policies", evidence(refused=frozenset({4}))).holds
     assert verdict("policies", evidence(refused=frozenset({5}))).holds is False
     assert verdict("policies", evidence(recorded=recorded(acted=np.array([9, 10])))).holds is False
+    lives = {**evidence().lives, AGENT: [Life({"policies.adopted": 10, "policies.foreign": 3}, True)]}
+    found = verdict("policies", evidence(lives=lives))
+    assert (found.holds, found.text, found.numbers["foreign"]) == (
+        True, "10 adopted, 0 refused, 3 foreign", 3,
+    )  # fmt: skip
+
+
+def test_a_version_is_refused_for_what_is_in_it(tmp_path: Path) -> None:
+    """The words are the agent's own. Version 3 acted before version 4 came; what came as 5, 6 and 7 was
+    forged or torn, and the learner's own may act yet; 8 is the learner's, and no policy."""
+    keys.make(tmp_path / "keys", now=datetime.now(UTC))
+    link = LinkConfig(secure=str(tmp_path / "keys"))
+    signer, verifier = open_signer(link, LEARNER, "run"), open_verifier(link, AGENT, "run")
+    signed = {version: signer.sign(policy(version, mean_bias=0.1)) for version in range(3, 8)}
+    broken = signer.sign(policy(8, mean_bias=float("nan")))
+    ledger, log = Ledger(AGENT, 1), tmp_path / "log.jsonl"
+    adoption = Adoption(SPEC, ledger, verifier, Past(floor=4))
+    for at_s, one in enumerate(
+        (
+            signed[4],
+            signed[3],
+            replace(signed[5], signature=b""),
+            replace(signed[6], window=2),
+            replace(signed[7], weights=b"others"),
+            broken,
+        ),
+        start=1,
+    ):
+        adoption.offer(one, at_s * COMPLAINT_NS)
+    told = [event.text for event in ledger.stats(0).events]
+    assert len(told) == 5
+    log.write_text("".join(json.dumps({"text": text}) + "\n" for text in told))
+    assert refused(log) == {8}
+
+
+def test_the_duration_is_counted_as_the_env_server_counts_it(tmp_path: Path) -> None:
+    """7200 s at 600 Hz: a period of 1 666 667 ns fits 4 319 999 times."""
+    config = RunConfig(duration_s=7200.0, env=EnvConfig(id="pointmass", hz=600.0))
+    found = gather(RunDir.create(tmp_path / "run", config), [], ended=False)
+    assert found.num_ticks == 4_319_999
+    config = dataclasses.replace(config, duration_s=0.0)
+    assert gather(RunDir.create(tmp_path / "endless", config), [], ended=False).num_ticks is None
 
 
 def test_deadlines_add_up() -> None:
@@ -183,9 +236,9 @@ def test_what_goes_on_still_has_rows_on_their_way() -> None:
     running = evidence(ended=False, summary=None, recorded=recorded(TICKS[:-5]))
     last = running.lives[ENV_SERVER]
     lives = {**running.lives, ENV_SERVER: [last[0], Life(last[1].counters, False)]}
-    clause = verdict("recording", replace(running, lives=lives))
+    clause = verdict("recording", dataclasses.replace(running, lives=lives))
     assert (clause.holds, clause.numbers["missing"], clause.numbers["died"]) == (True, 0, 2)
-    assert passed(judge(replace(running, lives=lives)))
+    assert passed(judge(dataclasses.replace(running, lives=lives)))
 
 
 def test_a_fault_that_found_nobody_is_told() -> None:

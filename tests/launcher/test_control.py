@@ -38,6 +38,10 @@ class Stage:
 
             self.hub.bus(name, self.clock).serve(name, answer)
 
+    def alive(self, *names: str) -> None:
+        for name in names:
+            self.hub.bus(name, self.clock).declare_alive(name)
+
     def tell(self, verb: str) -> int:
         return run_command([verb, "--run-dir", str(self.run.path)])
 
@@ -69,11 +73,33 @@ def test_who_does_not_answer_keeps_no_other_from_its_order(
     stage: Stage, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stage.serve("env_server.0", "env_server.2")
+    stage.alive("env_server.1")
     assert stage.tell("stop") == 1
     assert stage.orders == [("env_server.0", "stop"), ("env_server.2", "stop")]
     assert capsys.readouterr().err == (
         f"tenuto: env_server.1 does not answer in {stage.run.path}: is the run still going?\n"
     )
+
+
+def test_who_is_not_there_is_no_failure_if_another_one_is(
+    stage: Stage, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stage.serve("env_server.0", "env_server.2")
+    assert stage.tell("stop") == 0
+    assert stage.orders == [("env_server.0", "stop"), ("env_server.2", "stop")]
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        "env_server.0: env_server.0 says so",
+        "env_server.2: env_server.2 says so",
+        "env_server.1: is not there: it has ended, or is between two lives; then stop again",
+    ]
+    assert said.err == ""
+
+
+def test_nobody_there_is_a_failure(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+    assert stage.tell("stop") == 1
+    silence = f"does not answer in {stage.run.path}: is the run still going?"
+    assert capsys.readouterr().err == f"tenuto: {'; '.join(f'env_server.{i} {silence}' for i in range(3))}\n"
 
 
 def test_a_refusal_names_who_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:

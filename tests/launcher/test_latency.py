@@ -80,6 +80,14 @@ def test_wrong_options(options: LatencyOptions, field: str) -> None:
         plan(options)
 
 
+def test_one_pair_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = presets.load("pointmass")
+    monkeypatch.setattr(presets, "load", lambda name: replace(one, env=replace(one.env, count=3)))
+    with pytest.raises(ConfigError) as caught:
+        plan(LatencyOptions(env="three"))
+    assert str(caught.value) == "env = 'three': must be a preset of one environment: its env.count is 3"
+
+
 def test_defaults() -> None:
     assert plan(LatencyOptions()).rates == (100.0, 200.0, 500.0, 1000.0)
     assert plan(LatencyOptions()).loads == ("none", "learner")

@@ -75,12 +75,14 @@ def test_the_scales_by_hand() -> None:
     assert (moving["c_1"], moving["c_45"]) == pytest.approx((15.0, 13.5))
 
 
+@pytest.mark.parametrize("count", [1, 2])
 def test_a_plan_from_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The chain's s rises by 1/40 a unit, and with it both ends' rewards by 1/80: B(t, t + j) = j / 80."""
     lived = tenuto(
         "sim", "chain", "--duration-s", "5", "--run-dir", "lived", "--env.drift.kind", "ramp",
+        "--env.count", str(count),
         "--env.drift.span", "40", "--learner.schedule.l-f", "8", "--learner.schedule.gamma-f", "0.5",
         cwd=tmp_path,
     )  # fmt: skip
@@ -101,6 +103,7 @@ def test_a_plan_from_a_run(
     assert told["environment_term_alone"]["N"] == 4
     assert told["unit_s"] == 0.2
     assert any("exact" in remark for remark in told["remarks"])
+    assert ("what is recorded is of env0, the first of 2" in told["remarks"]) == (count == 2)
     monkeypatch.chdir(tmp_path)
     config = Path("lived/run.toml").read_text()
     for before, after in (("\ngamma = 0.9\n", "\ngamma = 1.0\n"), ('"npg"', '"q"')):  # q may, npg may not

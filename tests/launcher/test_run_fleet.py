@@ -52,6 +52,14 @@ def test_it_ended_with_its_duration_if_all_environments_did(ticks: tuple[int, ..
     assert run._why(End("duration"), FLEET, watch) == why
 
 
+@pytest.mark.parametrize(("ticks", "why"), [(4_319_999, "duration"), (4_319_998, "stopped")])
+def test_the_duration_is_counted_as_the_env_servers_count_it(ticks: int, why: str) -> None:
+    """7200 s at 600 Hz: a period of 1 666 667 ns fits 4 319 999 times."""
+    watch, config = Watch(600.0), replace(CONFIG, duration_s=7200.0, env=replace(CONFIG.env, hz=600.0))
+    watch.feed(ledger("env_server", counters={"ticks": ticks}), 0)
+    assert run._why(End("duration"), config, watch) == why
+
+
 def test_what_happened_names_the_process(tmp_path: Path) -> None:
     run_dir = RunDir.create(tmp_path / "r1", FLEET)
     died = Happening(3_000_000_000, "agent_service.2", "died", -9, "x")

@@ -12,7 +12,7 @@ from launcher.restarts import Happening
 from launcher.screen import Screen
 from launcher.summary import summarise
 from launcher.watch import Watch
-from rtcore.channels import AGENT, ENV_SERVER, LEARNER
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER, RECORDER
 from rtcore.clock import VirtualClock
 from rtcore.config import RecorderConfig, RunConfig
 from rtcore.messages import Event
@@ -110,6 +110,16 @@ def test_who_is_between_two_lives_and_how_often() -> None:
     assert screen.line().endswith("agent_service starting  learner down  restarts 3")
 
 
+def test_what_is_not_on_disk_is_on_the_line() -> None:
+    watch = watched()
+    assert "not on disk" not in screen_of(watch)[0].line()
+    watch.feed(
+        ledger(LEARNER, incarnation=2, counters={"replay.unbacked": 40, "tally.unbacked": 1}), 2 * SECOND
+    )
+    watch.feed(ledger(RECORDER, incarnation=2, counters={"disk_dropped": 5}), 2 * SECOND)
+    assert screen_of(watch)[0].line().endswith("  not on disk 46")
+
+
 def test_without_a_terminal_it_is_a_line_every_five_seconds() -> None:
     console, file = console_of(100)
     clock = VirtualClock(2 * SECOND)
@@ -167,6 +177,7 @@ def test_the_report_says_loudly_what_is_wrong(tmp_path: Path) -> None:
     env, agent = env_ledger(), agent_ledger()
     env.counters["ticks"] = 300
     agent.counters["policies.foreign"] = 2
+    agent.counters["policy_file.errors"] = 3
     summary = summarise(
         CONFIG,
         "r1",
@@ -181,6 +192,8 @@ def test_the_report_says_loudly_what_is_wrong(tmp_path: Path) -> None:
     for words in (
         "ticks = produced + resets: 300 != 200",
         "2 policies that are not the learner's",
+        "3 policies",
+        "not on disk",
         "learner 2",
         "recorder did not end in time",
         "learner ended unexpectedly (exit code 3)",

@@ -7,7 +7,7 @@ import pytest
 
 from launcher.fates import FATES
 from launcher.summary import discrepancies, summarise
-from rtcore.channels import AGENT, ENV_SERVER, LEARNER
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER, RECORDER
 from rtcore.messages import CAUSES
 from tests.launcher.ledgers import CONFIG, agent_ledger, agent_life, env_ledger, episode, ledger, whole_run
 
@@ -77,17 +77,52 @@ def test_the_whole_summary_of_a_small_run() -> None:
             "governor": {"decisions": 0, "limited_share": None},
         },
         "forecast": {"windows": None, "error": None, "baseline_error": None, "trust": None},
-        "recorder": {"rows": 900, "dropped": 7},
+        "recorder": {"rows": 900, "dropped": 7, "live_dropped": 0},
         "supervision": [],
         "restarts": {"env_server": 0, "agent_service": 0, "learner": 0, "recorder": 0},
         "messages": {
             "rejected": 3,
             "denied": 0,
             "links_refused": 0,
+            "unsent": 0,
+            "events_dropped": 0,
             "by_channel": {"action": 2, "policy": 1},
         },
-    }
+        "disk": {
+            "transitions": 0, "checkpoints": 0, "diary_entries": 0, "policies": 0, "schedules": 0,
+            "tallies": 0, "rows": 0,
+        },
+    }  # fmt: skip
     assert discrepancies(summary) == []
+
+
+def test_what_the_disk_did_not_take_is_told() -> None:
+    summary = summary_of(
+        {
+            LEARNER: [
+                ledger(LEARNER, counters={"replay.unbacked": 40, "checkpoint.errors": 2}),
+                ledger(LEARNER, incarnation=2, counters={"schedule_file.errors": 4}),
+            ],
+            RECORDER: [ledger(RECORDER, counters={"disk_dropped": 5, "tally.unbacked": 1, "dropped": 7})],
+            AGENT: [ledger(AGENT, counters={"policy_file.errors": 3, "tally.unbacked": 1})],
+        }
+    )
+    assert summary["disk"] == {
+        "transitions": 40, "checkpoints": 2, "diary_entries": 0, "policies": 3, "schedules": 4, "tallies": 2,
+        "rows": 5,
+    }  # fmt: skip
+
+
+def test_what_was_told_to_nobody_is_counted() -> None:
+    summary = summary_of(
+        {
+            AGENT: [ledger(AGENT, counters={"stats.unsent": 2, "events.dropped": 10})],
+            LEARNER: [ledger(LEARNER, counters={"stats.unsent": 1})],
+            RECORDER: [ledger(RECORDER, counters={"rows": 9, "dropped": 7, "live_dropped": 40})],
+        }
+    )
+    assert (summary["messages"]["unsent"], summary["messages"]["events_dropped"]) == (3, 10)
+    assert summary["recorder"] == {"rows": 9, "dropped": 7, "live_dropped": 40}
 
 
 def test_the_governors_share_is_of_the_ticks_that_it_saw() -> None:

@@ -42,6 +42,26 @@ def test_returns_are_kept_though_messages_carry_only_the_newest() -> None:
     assert [one.value for one in kept.returns] == [1.0, 2.0, 3.0]
 
 
+def test_a_screen_gets_the_newest_returns_and_the_best_and_the_summary_all() -> None:
+    values = [1000.0 if number == 5 else float(number % 97) for number in range(200)]
+    watch = Watch(100.0)
+    for seq, last in enumerate((40, 100, 64, 164, 200)):  # the third one was overtaken; each has the last 64
+        newest = [episode(number, values[number]) for number in range(max(0, last - 64), last)]
+        watch.feed(ledger(ENV_SERVER, seq=seq, returns=newest), seq)
+    for _ in range(2):  # also once its last words have been read
+        assert watch.totals(ENV_SERVER).returns == [1000.0, *values[-60:]]
+        (kept,) = watch.stats()[ENV_SERVER]
+        assert [one.value for one in kept.returns] == values
+        everything = [episode(*one) for one in enumerate(values)]
+        watch.feed_final([ledger(ENV_SERVER, seq=9, final=True, returns=everything)])
+
+
+def test_up_to_sixty_returns_are_shown_as_they_are() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(ENV_SERVER, returns=[episode(number, float(number % 7)) for number in range(60)]), 1)
+    assert watch.totals(ENV_SERVER).returns == [float(number % 7) for number in range(60)]
+
+
 def test_an_overtaken_message_changes_nothing() -> None:
     watch = Watch(100.0)
     watch.feed(ledger(ENV_SERVER, seq=5, counters={"ticks": 50}), 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,8 +20,11 @@ GROUPS = (
 @pytest.fixture(scope="session")
 def played(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
     """What a module's `play` has returned; raises what it raised."""
+    here = Path(__file__).parent  # other folders have a test_killed, too
     modules = {
-        item.path.stem: item.module for item in request.session.items if isinstance(item, pytest.Function)
+        item.path.stem: item.module
+        for item in request.session.items
+        if isinstance(item, pytest.Function) and item.path.parent == here
     }
     stories: dict[str, Future[Any]] = {}
 

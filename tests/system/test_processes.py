@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,16 +74,111 @@ def wait_for_ticks(run: Path, process: subprocess.Popen[str], timeout_s: float =
     raise AssertionError(f"no tick within {timeout_s} s")
 
 
-@pytest.fixture(scope="module")
-def whole_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def play_whole(run: Path) -> None:
     """Ten seconds of point mass with all four processes."""
-    run = tmp_path_factory.mktemp("whole") / "run"
     done = subprocess.run(
         tenuto("run", "pointmass", "--duration-s", "10", "--run-dir", str(run), *SMALL),
         capture_output=True, text=True, timeout=90, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    return run
+
+
+def play_held(run: Path) -> None:
+    """A run that an operator holds and resumes."""
+    always = ("--learner.schedule.gamma-f", "1.0", "--duration-s", "60", "--run-dir", str(run))
+    with running("run", "pointmass", *SMALL, *always) as process:
+        wait_for_ticks(run, process)
+        time.sleep(3.0)
+        order(run, "hold")
+        time.sleep(3.0)
+        order(run, "resume")
+        time.sleep(3.0)
+        assert "gradient steps" in order(run, "status")
+        order(run, "stop")
+        finish(process, 30)
+        assert process.returncode == 0
+
+
+def play_interrupted(run: Path) -> None:
+    with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
+        wait_for_ticks(run, process)
+        time.sleep(2.0)
+        begin = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        output = finish(process, 20)
+        took_s = time.monotonic() - begin
+    assert process.returncode == 0, output
+    assert took_s < 7.0, output  # 5 s are promised; 2 more for a busy machine
+
+
+def play_interrupted_twice(run: Path) -> None:
+    with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
+        wait_for_ticks(run, process)
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        finish(process, 10)
+    assert process.returncode == 130
+
+
+def play_sequence(sequence: Sequence[str], run: Path) -> None:
+    """Each process by its own command, in that order; the first one makes the run."""
+    settings = ("pointmass", *SMALL, "--env.start-wait-s", "3", "--duration-s", "14", "--run-dir", str(run))
+    started: dict[str, subprocess.Popen[bytes]] = {}
+    try:
+        for command in sequence:
+            arguments = tenuto(command, *(settings if not started else ("--run-dir", str(run))))
+            started[command] = subprocess.Popen(arguments)
+            time.sleep(4.0 if command == "env" else 1.0)
+        assert started["env"].wait(45) == 0
+        for command in ("agent", "learn", "record"):
+            started[command].send_signal(signal.SIGTERM)
+            assert started[command].wait(20) == 0
+    finally:
+        for process in started.values():
+            process.kill()
+
+
+# By the name of the fixture that waits for it. Two at a time, for two cores: they mostly wait.
+STORIES: dict[str, Callable[[Path], None]] = {
+    "env_last": partial(play_sequence, ("record", "learn", "agent", "env")),
+    "env_first": partial(play_sequence, ("env", "agent", "record", "learn")),
+    "held_run": play_held,
+    "whole_run": play_whole,
+    "interrupted_run": play_interrupted,
+    "twice_interrupted_run": play_interrupted_twice,
+}
+
+
+@pytest.fixture(scope="module")
+def played_here(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Callable[[str], Path]]:
+    """Where the run of a story is, once it is over; raises what it raised."""
+    here = [item for item in request.session.items if item.path == request.path]
+    wanted = {name for item in here if isinstance(item, pytest.Function) for name in item.fixturenames}
+    homes = {name: tmp_path_factory.mktemp(name) / "run" for name in STORIES if name in wanted}
+    with ThreadPoolExecutor(2) as pool:
+        futures = {name: pool.submit(STORIES[name], home) for name, home in homes.items()}
+
+        def told(name: str) -> Path:
+            futures[name].result()
+            return homes[name]
+
+        yield told
+
+
+def story(name: str) -> Any:
+    """The fixture of a story: its run."""
+
+    @pytest.fixture(name=name)
+    def told(played_here: Callable[[str], Path]) -> Path:
+        return played_here(name)
+
+    return told
+
+
+env_last, env_first, held_run, whole_run, interrupted_run, twice_interrupted_run = map(story, STORIES)
 
 
 def test_the_summary_reconciles_and_nothing_is_lost(whole_run: Path) -> None:
@@ -135,21 +232,8 @@ def test_the_recording_verifies(whole_run: Path) -> None:
     assert subprocess.run(verify, capture_output=True, timeout=30, check=False).returncode == 0
 
 
-def test_an_operators_hold_stops_publishing_and_resume_goes_on(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    always = ("--learner.schedule.gamma-f", "1.0", "--duration-s", "60", "--run-dir", str(run))
-    with running("run", "pointmass", *SMALL, *always) as process:
-        wait_for_ticks(run, process)
-        time.sleep(3.0)
-        order(run, "hold")
-        time.sleep(3.0)
-        order(run, "resume")
-        time.sleep(3.0)
-        assert "gradient steps" in order(run, "status")
-        order(run, "stop")
-        finish(process, 30)
-        assert process.returncode == 0
-    recording = run / "recording.rrd"
+def test_an_operators_hold_stops_publishing_and_resume_goes_on(held_run: Path) -> None:
+    recording = held_run / "recording.rrd"
     times, lines = texts(recording, "/log")
     (held,) = [t for t, line in zip(times, lines, strict=True) if "operator: hold" in line]
     (resumed,) = [t for t, line in zip(times, lines, strict=True) if "operator: resume" in line]
@@ -157,7 +241,7 @@ def test_an_operators_hold_stops_publishing_and_resume_goes_on(tmp_path: Path) -
     assert not ((published > held) & (published < resumed)).any()
     assert (published < held).any() and (published > resumed).any()
     assert [s.state for s in spans(recording) if s.start_ns >= held] == ["hold", "update"]
-    assert summary_of(run)["operator_holds"] == 1
+    assert summary_of(held_run)["operator_holds"] == 1
 
 
 def order(run: Path, verb: str) -> str:
@@ -168,55 +252,22 @@ def order(run: Path, verb: str) -> str:
     return done.stdout
 
 
-def test_one_interrupt_ends_in_order_within_five_seconds_with_all_files_whole(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
-        wait_for_ticks(run, process)
-        time.sleep(2.0)
-        begin = time.monotonic()
-        process.send_signal(signal.SIGINT)
-        output = finish(process, 20)
-        took_s = time.monotonic() - begin
-    assert process.returncode == 0, output
-    assert took_s < 7.0, output  # 5 s are promised; 2 more for a busy machine
-    summary = summary_of(run)
+def test_one_interrupt_ends_in_order_within_five_seconds_with_all_files_whole(interrupted_run: Path) -> None:
+    summary = summary_of(interrupted_run)
     assert summary["ended"] == "interrupted" and summary["forced"] == []
     assert discrepancies(summary) == [] and summary["transitions"]["lost"] == 0
-    assert len(columns(run / "recording.rrd", "/env/reward")[0]) == summary["ticks"]
+    assert len(columns(interrupted_run / "recording.rrd", "/env/reward")[0]) == summary["ticks"]
 
 
-def test_two_interrupts_end_at_once(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
-        wait_for_ticks(run, process)
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        finish(process, 10)
-    assert process.returncode == 130
+def test_two_interrupts_end_at_once(twice_interrupted_run: Path) -> None:
+    assert twice_interrupted_run.is_dir()  # within 10 s, with exit code 130
 
 
-@pytest.mark.parametrize(
-    "sequence", [("record", "learn", "agent", "env"), ("env", "agent", "record", "learn")]
-)
+@pytest.mark.parametrize("sequence", ["env_last", "env_first"])
 def test_any_process_may_be_first_and_a_late_learner_is_picked_up(
-    sequence: Sequence[str], tmp_path: Path
+    sequence: str, env_last: Path, env_first: Path
 ) -> None:
-    run = tmp_path / "run"
-    settings = ("pointmass", *SMALL, "--env.start-wait-s", "3", "--duration-s", "14", "--run-dir", str(run))
-    started: dict[str, subprocess.Popen[bytes]] = {}
-    try:
-        for command in sequence:
-            arguments = tenuto(command, *(settings if not started else ("--run-dir", str(run))))
-            started[command] = subprocess.Popen(arguments)
-            time.sleep(4.0 if command == "env" else 1.0)
-        assert started["env"].wait(45) == 0
-        for command in ("agent", "learn", "record"):
-            started[command].send_signal(signal.SIGTERM)
-            assert started[command].wait(20) == 0
-    finally:
-        for process in started.values():
-            process.kill()
+    run = env_last if sequence == "env_last" else env_first
     stats = {s.process: s for s in RunDir.open(run).read_final_stats()}
     assert stats["learner"].counters["learned"] == stats["env_server"].counters["produced"]
     assert stats["agent_service"].counters["policies.adopted"] >= 3
