@@ -32,6 +32,7 @@ class Intake:
     """
 
     def __init__(self, bus: Bus, envs: Sequence[str], telemetry: TelemetryRows) -> None:
+        self._known: set[str] = set()  # environments that declared themselves
         self._specs = {env: bus.latest(channels.SPEC, env) for env in envs}
         self._logs = {env: LogReader(bus, env, capacity_batches=LOG_CAPACITY) for env in envs}
         self._stats = bus.queue(channels.STATS, "*", capacity=STATS_CAPACITY)
@@ -76,8 +77,12 @@ class Intake:
 
     def take_specs(self) -> dict[str, Spec]:
         """The env servers' declarations that are new, by environment."""
-        received = {env: reader.take() for env, reader in self._specs.items()}
-        return {env: spec.message for env, spec in received.items() if spec is not None}
+        taken = {env: reader.take() for env, reader in self._specs.items()}
+        found = {env: received.message for env, received in taken.items() if received is not None}
+        for env in found.keys() - self._known:  # the log is of the world that is written of
+            self._known.add(env)
+            self._logs[env].expect(found[env])
+        return found
 
     def take_steps(self, env: str, now_ns: int) -> list[Step]:
         """An environment's new steps in order, each once; those behind a missing one come when it does, or

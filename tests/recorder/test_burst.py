@@ -19,8 +19,8 @@ from rtcore.log_reader import LogReader
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Step, StepBatch
 from rtcore.zenoh_senders import LOSSLESS_CACHE
-from tests.recorder.stage import SPEC, T0, UNIT, make_step
 from tests.recorder.fleet_stage import set_fleet, tick_of, ticks
+from tests.recorder.stage import SPEC, T0, UNIT, make_step
 
 
 @pytest.mark.parametrize("count", [1, 5])
