@@ -133,6 +133,7 @@ class Loop:
     risen_for: int | None = None  # ticks since power was taken back; None: it was given up since
     rest: int = 0  # ticks for which giving way is known to be in vain
     excused_share: float = 0.0  # of tight ticks without the learner, as it was found then
+    fed_ns: int = 0  # when something of it came last
     _previous: Step | None = None
     _previous_lost: bool = False
     _work: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=4096))  # (begin, end)
@@ -227,14 +228,15 @@ class Governor:
     def feed(self, steps: Iterable[Step], now_ns: int) -> Decision | None:
         """Take the next steps of the logs, those of each in order; return what is decided at `now_ns`, if
         anything is."""
-        fed: dict[str, Loop] = {}
         for step in steps:
-            loop = fed[step.env] = self._loops[step.env]
+            loop = self._loops[step.env]
             loop.take(step, self._changed_ns)
-        awake = [loop for loop in fed.values() if not self._rests(loop)]
-        for loop in awake:
-            if loop.evidence.troubled:
-                return self._give_way(loop, now_ns)
+            loop.fed_ns = now_ns
+        recent_ns = now_ns - round(WINDOW_S * 1e9)
+        awake = [one for one in self._loops.values() if one.fed_ns > recent_ns and not self._rests(one)]
+        troubled = [loop for loop in awake if loop.evidence.troubled]
+        if troubled:  # one that giving way helps comes before one that it does not
+            return self._give_way(min(troubled, key=lambda loop: loop.evidence.in_vain), now_ns)
         patience = self._in_ticks(self._patience_s) * self.power.duty
         if self.limited and any(loop.clean >= patience for loop in awake):
             for loop in self._loops.values():

@@ -19,9 +19,10 @@ class Intake:
 
     Attributes:
         env: its name.
-        declared: of what it declared, the first that was accepted; None: nothing of it is read yet.
+        declared: of what it declared, the one that was accepted; None: nothing of it is read yet.
         refused: it declared another task: nothing of it is read.
-        counts: of this learner, by `COUNTED`, up to the step that was learned last.
+        counts: of this learner, by `COUNTED`, up to the step that was learned last; of repeated ones all that
+            came. So `received` is what was taken in and what was repeated.
         before: what earlier learners of the run committed, likewise.
     """
 
@@ -64,13 +65,28 @@ class Intake:
         if spec.actions:  # numbered: nothing to scale
             self._middle, self._half_span = np.zeros(1, np.float32), np.ones(1, np.float32)
 
+    def accept(self, spec: Spec) -> None:
+        """Read it from now on, as the world that it declared."""
+        self.declared = spec
+        self._log.expect(spec)
+
     def wait(self, timeout_s: float) -> None:
         """Wait until something has come, at most so long."""
         self._log.wait(timeout_s)
 
     def read(self, now_ns: int) -> list[Step]:
         """What has come, in order: `learn` from each."""
-        return [] if self.declared is None else self._log.read(now_ns)
+        if self.declared is None:
+            return []
+        steps, stream = self._log.read(now_ns), self._log.stream
+        repeated = stream.duplicate + stream.late
+        self.counts["received"] += repeated - self.counts["duplicate"]
+        self.counts["duplicate"] = repeated
+        return steps
+
+    def discard(self) -> int:
+        """Leave unread what has come; returns the number of steps. For one that was refused."""
+        return self._log.discard()
 
     def finish(self) -> list[Step]:
         """Nothing follows: give up on gaps, and return what waited behind them."""
@@ -88,15 +104,11 @@ class Intake:
                 transition.terminated,
                 transition.unit,
             )
+        due = self._position[1] if self._position and self._position[0] == step.incarnation else 0
+        self.counts["gaps"] += step.seq - due  # those of the stream are ahead of the replay
+        self.counts["received"] += 1
         self._position = (step.incarnation, step.seq + 1)
         learned = self._transitions.transitions - self.counts["learned"]
         self.counts["learned"] += learned
         self.counts["broken"] = self._transitions.broken + self._transitions.invalid
         return learned
-
-    def count_stream(self) -> None:
-        """Take over what the stream counts. It is ahead of the replay until all that was read is learned."""
-        stream = self._log.stream
-        self.counts["received"] = stream.received
-        self.counts["duplicate"] = stream.duplicate + stream.late
-        self.counts["gaps"] = stream.gaps

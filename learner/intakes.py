@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge
 from operator import attrgetter
@@ -14,7 +15,7 @@ from learner.intake import COUNTED, Intake
 from learner.place import Course, Place
 from learner.replay import Replay
 from learner.store import MARGIN
-from rtcore import channels
+from rtcore import cast, channels
 from rtcore.admission import check_same_task, is_same_world
 from rtcore.bus import Bus
 from rtcore.clock import Clock
@@ -39,9 +40,11 @@ class Intakes:
     Counts `received` (steps), `learned` (transitions in the replay), `duplicate`, `gaps` (steps that
     never came in time) and `broken` (steps that fit to no transition), each together with the commit:
     whatever kills the learner, its counters and those of the learners after it add up to what was committed.
-    Of a fleet each of them as `learned.<env>` too: they add up to `learned`.
+    Of a fleet each of them as `learned.<env>` too: they add up to `learned`. Besides `replay.raised`, the
+    transitions that were filed under a newer unit than their own, because another environment was ahead.
 
-    An environment of another task than the first one that declared itself is refused for good.
+    An environment of another task than the first one that declared itself is refused for good; the steps of
+    it that come are `refused.<env>`.
     """
 
     def __init__(self, bus: Bus, envs: Sequence[str], clock: Clock, ledger: Ledger, diary: Diary) -> None:
@@ -49,11 +52,13 @@ class Intakes:
         self._specs = {env: bus.latest(channels.SPEC, env) for env in envs}
         capacity = max(CAPACITY_BATCHES // len(envs), LEAST_BATCHES)
         self._intakes = {env: Intake(bus, env, capacity) for env in envs}
+        self._fleet = len(envs) > 1
         self._replay: Replay | None = None
         self._task: Spec | None = None  # the first declaration of all
         # What earlier learners committed less what they counted: above 0 if one was killed in between; below
         # 0 if one went on in memory, then what it took in comes again.
-        self._owed: dict[str, int] = {}
+        self._owed: dict[tuple[str, str], int] = {}  # by environment and counter
+        self._short: Counter[str] = Counter()  # of the totals, where one was killed before it came to them
 
     @property
     def envs(self) -> tuple[str, ...]:
@@ -71,11 +76,12 @@ class Intakes:
         return 0 if self._replay is None else len(self._replay)
 
     def declared(self) -> Spec | None:
-        """The task, as soon as one of the environments has declared itself."""
-        for reader in self._specs.values():
+        """The task, as soon as one of the environments has declared itself. Its T0 is the run's, whichever
+        did."""
+        for number, reader in enumerate(self._specs.values()):
             received = reader.take()
             if received is not None:
-                return received.message
+                return self._of_the_run(received.message, number)
         return None
 
     def meet(self, spec: Spec, replay: Replay, place: Place, counted: Mapping[str, int]) -> None:
@@ -92,9 +98,13 @@ class Intakes:
         self._diary.meet(spec, self.envs, acted)
         for env, intake in self._intakes.items():
             intake.meet(spec, place.envs[env])
-        self._intakes[spec.env].declared = spec
-        before = self._named({env: intake.before for env, intake in self._intakes.items()})
-        self._owed = {name: count - counted.get(name, 0) for name, count in before.items()}
+        self._intakes[spec.env].accept(spec)
+        for env, intake in self._intakes.items():
+            for name, count in intake.before.items():
+                told = counted.get(self._name(name, env), 0)
+                self._owed[env, name] = count - told
+                self._short[name] += told
+        self._short.subtract({name: counted.get(name, 0) for name in COUNTED})
         self._account(replay)
 
     def wait(self, timeout_s: float) -> None:
@@ -115,6 +125,9 @@ class Intakes:
                 received = reader.take()
                 if received is not None:
                     self._hear(self._intakes[env], received.message)
+            for env, intake in self._intakes.items():
+                if intake.refused:
+                    self._ledger.count(f"refused.{env}", intake.discard())
             yield from self._learn(self._replay, [intake.read(now_ns) for intake in self._intakes.values()])
 
     def finish(self) -> Iterator[Taken]:
@@ -137,7 +150,7 @@ class Intakes:
         assert self._task is not None
         if intake.declared is not None:
             if spec.incarnation != intake.declared.incarnation and is_same_world(spec, intake.declared):
-                who = "the env server" + (f" of {intake.env}" if len(self._intakes) > 1 else "")
+                who = "the env server" + (f" of {intake.env}" if self._fleet else "")
                 text = f"{who} came back; units and windows go on by its first clock"
                 self._ledger.event(self._clock.now_ns(), "WARN", text)
             return
@@ -152,7 +165,7 @@ class Intakes:
                 self._ledger.event(self._clock.now_ns(), "ERROR", text)
             intake.refused = True
             return
-        intake.declared = spec
+        intake.accept(spec)
 
     def _learn(self, replay: Replay, logs: list[list[Step]]) -> Iterator[Taken]:
         """By tick, so that units rise although a lot may have come of each."""
@@ -161,15 +174,18 @@ class Intakes:
             part = steps[begin : begin + MARGIN]
             learned = sum(self._intakes[step.env].learn(replay, step) for step in part)
             self._diary.acted(part)
-            if part[-1] is steps[-1]:
-                for intake in self._intakes.values():
-                    intake.count_stream()
             yield Taken(learned, part)
 
     def _account(self, replay: Replay) -> None:
-        counts = self._named({env: intake.counts for env, intake in self._intakes.items()})
-        for name, count in counts.items():
-            self._ledger.set_counter(name, max(0, self._owed[name] + count))
+        total = self._short.copy()
+        for env, intake in self._intakes.items():
+            for name, count in intake.counts.items():
+                told = max(0, self._owed[env, name] + count)
+                total[name] += told
+                self._ledger.set_counter(self._name(name, env), told)
+        if self._fleet:
+            for name, count in (*total.items(), ("replay.raised", replay.raised_units)):
+                self._ledger.set_counter(name, count)
         if replay.fault is None:
             return
         if self._ledger.counter("replay.unbacked") == 0:
@@ -177,9 +193,11 @@ class Intakes:
             self._ledger.event(self._clock.now_ns(), "ERROR", text)
         self._ledger.set_counter("replay.unbacked", max(1, replay.unbacked))
 
-    def _named(self, counts: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
-        """Counts by environment as the ledger calls them."""
-        named = {name: sum(one[name] for one in counts.values()) for name in COUNTED}
-        if len(counts) > 1:
-            named |= {f"{name}.{env}": one[name] for env, one in counts.items() for name in COUNTED}
-        return named
+    def _name(self, counter: str, env: str) -> str:
+        """As the ledger calls it."""
+        return f"{counter}.{env}" if self._fleet else counter
+
+    def _of_the_run(self, spec: Spec, number: int) -> Spec:
+        """The declaration of environment `number` with the T0 that it is shifted against."""
+        offset_ns = cast.offset_ns(number, len(self._specs), spec.tick_ns)
+        return replace(spec, t0_ns=spec.t0_ns - offset_ns, wall_t0_ns=spec.wall_t0_ns - offset_ns)

@@ -114,7 +114,7 @@ class Marks:
 
         Args:
             path: of the file.
-            shape: of the ring.
+            shape: of the ring. What is left out is 1.
             room: bytes that a note may have.
 
         Raises:
@@ -170,7 +170,9 @@ def _require(path: Path, header: bytes, wanted: dict[str, int]) -> None:
     except (ValueError, TypeError) as error:
         raise MarksError(f"{path}: not readable ({error})") from None
     differences = [
-        f"{key} {found.get(key)} (wanted {value})" for key, value in wanted.items() if found.get(key) != value
+        f"{key} {found.get(key, 1)} (wanted {wanted.get(key, 1)})"
+        for key in found | wanted
+        if found.get(key, 1) != wanted.get(key, 1)
     ]
     if differences:
         raise MarksError(f"{path.parent}: {', '.join(differences)}")

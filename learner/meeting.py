@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,28 +56,18 @@ def meet(
     Raises:
         ConfigError: something does not fit, and `learner.on_mismatch` is "refuse".
     """
-    learner, fresh = config.learner, config.learner.on_mismatch == "fresh"
-    envs = env_names(config.env)
 
     def tell(text: str) -> None:
         ledger.event(clock.now_ns(), "WARN", text)
 
-    def load() -> tuple[Replay, Place]:
-        dims = spec.observation_dim, spec.action_dim
-        found = open_replay(directory, learner.replay_capacity, *dims, envs=len(envs))
-        return found, _place(found.committed, envs)
-
     for name in ("", resume.REPLAY_DIR, resume.CHECKPOINT_DIR):
         sweep(run_dir.learner_dir / name)
-    directory = run_dir.learner_dir / resume.REPLAY_DIR
-    (replay, place), _ = resume.fitting(load, directory, fresh=fresh, tell=tell)
-    if replay.committed is None or not replay.committed.note:
-        place = _left(directory, envs)
+    replay, place = _held(config, run_dir, spec, tell)
     seed = config.seed * 10 + LEARNER_STREAM
     algorithm = make_algorithm(config, Spaces.of(spec), seed, replay)
     directory = run_dir.learner_dir / resume.CHECKPOINT_DIR
     restored, aside = resume.fitting(
-        lambda: resume.restore(run_dir, algorithm), directory, fresh=fresh, tell=tell
+        lambda: resume.restore(run_dir, algorithm), directory, fresh=_fresh(config), tell=tell
     )
     saved = restored or resume.Spent()
     earned = max(place.course.earned, saved.earned)
@@ -90,11 +80,37 @@ def meet(
         source = "no checkpoint" if restored is None else "the checkpoint"
         text = f"goes on from {source}: policy {published.version}, {len(replay)} transitions in the replay"
         ledger.event(clock.now_ns(), "INFO", text)
-    newest = published.policy
-    settled = place.course.settled
-    if newest is not None:  # it reaches the disk before anybody gets it
-        settled = max(settled, (newest.created_ns - spec.t0_ns) // spec.unit_ns)
+    settled = max(place.course.settled, _published_in(published, spec, clock.now_ns()))
     return Beginning(replay, algorithm, place, counted, published, settled)
+
+
+def _fresh(config: RunConfig) -> bool:
+    return config.learner.on_mismatch == "fresh"
+
+
+def _held(
+    config: RunConfig, run_dir: RunDir, spec: Spec, tell: Callable[[str], None]
+) -> tuple[Replay, Place]:
+    """The replay, and where the run stands with it."""
+    directory, envs = run_dir.learner_dir / resume.REPLAY_DIR, env_names(config.env)
+    dims = spec.observation_dim, spec.action_dim
+
+    def load() -> tuple[Replay, Place]:
+        found = open_replay(directory, config.learner.replay_capacity, *dims, envs=len(envs))
+        return found, _place(found.committed, envs)
+
+    (replay, place), _ = resume.fitting(load, directory, fresh=_fresh(config), tell=tell)
+    if replay.committed is None or not replay.committed.note:
+        place = _left(directory, envs)
+    return replay, place
+
+
+def _published_in(published: Published, spec: Spec, now_ns: int) -> int:
+    """The unit of the newest policy, which reaches the disk before anybody gets it; -1: it says nothing."""
+    newest = published.policy
+    if newest is None or newest.created_ns > now_ns:  # a stamp ahead of the clock is of an earlier boot
+        return -1
+    return (newest.created_ns - spec.t0_ns) // spec.unit_ns
 
 
 def _left(directory: Path, envs: Collection[str]) -> Place:

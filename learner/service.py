@@ -31,6 +31,7 @@ from learner.place import Course
 from learner.power import Levers, PowerControl
 from learner.publication import Publication
 from learner.schedule.scheduler import Scheduler
+from rtcore import epoch
 from rtcore.bus import Bus
 from rtcore.cast import env_names
 from rtcore.clock import Clock
@@ -143,7 +144,8 @@ class LearnerService:
             spec = self._intake.declared()
             if spec is None:
                 return
-            self._meet(spec)
+            now_ns, wall_ns = self._clock.now_ns(), time.time_ns()
+            self._meet(epoch.on_this_clock(spec, now_ns=now_ns, wall_ns=wall_ns, boot_id=epoch.this_boot()))
         now_ns = self._clock.now_ns()
         self._power.watch(self._learn_from(self._intake.take(now_ns)), now_ns)
 

@@ -18,7 +18,7 @@ from learner.marks import Marks, MarksError, Record, pack, unpack
 from rtcore.files import write_atomic
 
 MARGIN = 1024  # rows between two commits, at most
-SCHEMA = 3  # 2: the cursor was written at the end alone
+SCHEMA = 4  # 3: of one environment, which had no name; 2: the cursor was written at the end alone
 _NOTE_BYTES = 4096  # of each environment, beside an observation
 _MOST_RESERVED = 1 << 16  # rows; the oldest so many are given up when the host ends
 MARKS, _SYNCED, _OLD_CURSOR = "marks.bin", "synced.bin", "cursor.json"
@@ -86,7 +86,7 @@ class Store:
             "capacity": capacity,
             "observation_dim": observation_dim,
             "action_dim": action_dim,
-        }
+        } | ({"envs": envs} if envs > 1 else {})
         marks = Marks.open(path, shape, envs * (_NOTE_BYTES + 4 * observation_dim))
         mapped = MappedColumns.open(directory, rows, observation_dim, action_dim, new=marks.newest.added == 0)
         synced = _read(directory / _SYNCED)

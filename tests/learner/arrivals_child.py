@@ -26,6 +26,7 @@ from learner.marks import Marks
 from learner.service import LearnerService
 from rtcore import channels
 from rtcore.bus import Publisher
+from rtcore.cast import env_names, offset_ns
 from rtcore.clock import VirtualClock
 from rtcore.ledger import Ledger
 from rtcore.memory_bus import MemoryHub
@@ -124,13 +125,15 @@ def live(run: RunDir, arrivals: Arrivals, life: Life | None) -> None:
     now_ns = arrivals.batches[max(0, begin - 1)][0] + (begin > 0) * 30_000_000  # the outage takes some time
     clock, hub = VirtualClock(now_ns), MemoryHub()
     logs: dict[tuple[str, int], Publisher[StepBatch]] = {}
+    names = env_names(run.config().env)
 
     def send(batch: StepBatch) -> None:
         """By a publisher of each life of an env server, whose cache can be reached for ever."""
         name, incarnation = life = batch.steps[0].env, batch.steps[0].incarnation
         if life not in logs:
             env = hub.bus(channels.ENV_SERVER, clock)
-            spec = msgspec.structs.replace(arrivals.spec, env=name, incarnation=incarnation)
+            t0_ns = arrivals.spec.t0_ns + offset_ns(names.index(name), len(names), arrivals.spec.tick_ns)
+            spec = msgspec.structs.replace(arrivals.spec, env=name, incarnation=incarnation, t0_ns=t0_ns)
             env.publisher(channels.SPEC, name).put(spec)
             logs[life] = env.publisher(channels.LOG, name)
         logs[life].put(batch)

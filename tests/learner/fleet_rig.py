@@ -10,6 +10,7 @@ import msgspec
 from learner.power import Levers
 from learner.replay import Replay, open_replay
 from rtcore import channels
+from rtcore.cast import offset_ns as offset_of
 from rtcore.clock import VirtualClock
 from rtcore.config import RunConfig
 from rtcore.messages import Spec, Step, StepBatch
@@ -75,7 +76,10 @@ class Fleet(Rig):
 
 
 def spec(env: str, **changed: object) -> Spec:
-    return msgspec.structs.replace(SPEC, env=env, **changed)
+    """Each has the run's T0, 0, and a part of a period."""
+    offset_ns = offset_of(ENVS.index(env), len(ENVS), TICK_NS)
+    t0 = {"t0_ns": SPEC.t0_ns + offset_ns, "wall_t0_ns": SPEC.wall_t0_ns + offset_ns}
+    return msgspec.structs.replace(SPEC, env=env, **{**t0, **changed})
 
 
 def held(run_dir: RunDir) -> Replay:

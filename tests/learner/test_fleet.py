@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from learner import intake
+from learner import intake, intakes
 from learner.intake import COUNTED
 from learner.power import Levers
 from rtcore.bus import Bus
@@ -34,7 +34,7 @@ def test_of_one_environment_nothing_is_counted_twice(run_dir: RunDir) -> None:
     rig = Rig(run_dir)
     rig.specs.put(SPEC)
     rig.live(0, 5)
-    assert not [name for name in rig.ledger.stats(0).counters if "env" in name]
+    assert not [name for name in rig.ledger.stats(0).counters if "env" in name or "raised" in name]
 
 
 def test_units_rise_although_a_lot_comes_of_one_after_the_other(run_dir: RunDir) -> None:
@@ -81,8 +81,35 @@ def test_one_comes_back_while_the_others_go_on(run_dir: RunDir) -> None:
     assert (rig.counts("gaps"), rig.counts("broken")) == ((0,) * 4, (0,) * 4)
     told = [text for text in events(rig) if "came back" in text]
     assert told == ["the env server of env1 came back; units and windows go on by its first clock"]
-    rig.learner.close()
-    assert held(run_dir).raised_units == 0
+    assert rig.ledger.counter("replay.raised") == 0
+
+
+def test_what_comes_when_another_is_in_a_later_unit_is_filed_there_and_counted(run_dir: RunDir) -> None:
+    """Ticks 5 to 12 of each in a batch, taken in one after the other; unit 1 begins with tick 10. So 5 to 9
+    of env1 come after tick 12 of env0, and those of env2 likewise."""
+    rig = Fleet(run_dir)
+    rig.all_live(0, 4)
+    rig.clock.sleep_until_ns(12 * TICK_NS)
+    for env in ENVS:
+        rig.send(env, 5, 12)
+        rig.learner.catch_up()
+    assert rig.ledger.counter("replay.raised") == 10
+    rows = held(run_dir).read(0, 1000)
+    in_unit_0 = [int(((rows.reward == env) & (rows.unit == 0)).sum()) for env in range(3)]
+    assert in_unit_0 == [9, 4, 4]
+    assert rig.counts("learned") == (36, 12, 12, 12)
+
+
+@pytest.mark.parametrize("first", ENVS)
+def test_units_and_windows_are_the_runs_whichever_declares_itself_first(first: str, run_dir: RunDir) -> None:
+    """Each has a T0 of its own, a third of a tick after that of the one before."""
+    rig = Fleet(run_dir, declare=[first])
+    rig.all_live(0, 22)
+    second = Fleet(run_dir, at=23, declare=[first])
+    second.all_live(23, 45)
+    for one, begins in ((rig, [0, 20]), (second, [23, 40])):  # the second comes in the middle of a hold
+        notices = [received.message for received in one.windows.drain()]
+        assert [notice.at_ns for notice in notices] == [begin * TICK_NS for begin in begins]
 
 
 def test_a_gap_in_one_does_not_hold_up_the_others(run_dir: RunDir) -> None:
@@ -166,10 +193,26 @@ def test_an_environment_of_another_task_is_refused_for_good(run_dir: RunDir) -> 
     assert told == [
         "nothing is learned from env2, another task than env0: unit_ns = 2000000000: the world has 1000000000"
     ]
+    assert rig.ledger.counter("refused.env2") == 20
     for env in ("env0", "env1"):
         rig.logs[env].put(StepBatch(steps=[], last=True))
     rig.learner.catch_up()
     assert rig.learner._intake.ended
+
+
+def test_what_a_refused_environment_sends_does_not_pile_up(
+    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is room for ten batches of each."""
+    monkeypatch.setattr(intakes, "CAPACITY_BATCHES", 30)
+    monkeypatch.setattr(intakes, "LEAST_BATCHES", 10)
+    rig = Fleet(run_dir, declare=["env0", "env1"])
+    rig.all_live(0, 4)  # nobody knows yet what env2 is
+    rig.declare["env2"].put(spec("env2", unit_ns=2 * SPEC.unit_ns))
+    rig.all_live(5, 29)
+    assert rig.learner._intake._bus.rejected() == {"spec": 1}
+    assert rig.ledger.counter("refused.env2") == 30
+    assert rig.counts("received") == (60, 30, 30, 0)
 
 
 def test_it_ends_when_all_have_ended(run_dir: RunDir) -> None:

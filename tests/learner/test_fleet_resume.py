@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 
 from learner import intakes
+from learner.columns import MappedColumns
 from learner.diary import Acted
 from learner.intake import COUNTED
 from learner.intakes import Intakes
 from learner.place import Course, Place, Progress
 from learner.replay import Replay, open_replay
 from rtcore.config import ConfigError
+from rtcore.ledger import Ledger
 from rtcore.run_dir import RunDir
-from tests.learner.fleet_rig import ENVS, FLEET, Fleet, held, tick
-from tests.learner.test_resume import Killed, counted, events, killed
+from tests.learner.fleet_rig import ENVS, FLEET, Fleet, held, spec, tick
+from tests.learner.test_resume import Killed, counted, events, killed, start
+from tests.learner.test_resume_disk import full
 
 
 def test_the_next_learner_goes_on_in_each_log_where_the_killed_one_was(run_dir: RunDir) -> None:
@@ -54,11 +57,23 @@ def test_killed_in_a_commit_nothing_is_learned_twice_or_lost(
 
 
 def test_killed_between_two_parts_of_what_came(run_dir: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first part ends in tick 7 of env1."""
+    """The env server of env1 dies after tick 5 and after tick 15; ticks 3 and 14 never come. The first part
+    ends in tick 7 of each: 8 + 7 + 8 steps. So the next learner begins between the two gaps."""
     monkeypatch.setattr(intakes, "MARGIN", 23)
-    first = Fleet(run_dir, at=20)
-    for env in ENVS:
-        first.send(env, 0, 19)
+
+    def send(rig: Fleet) -> Fleet:
+        for incarnation in (8, 9):
+            rig.declare["env1"].put(spec("env1", incarnation=incarnation))
+        for env in ("env0", "env2"):
+            rig.send(env, 0, 19)
+        rig.send("env1", 0, 2)
+        rig.send("env1", 4, 5)
+        rig.send("env1", 0, 7, incarnation=8, begin=6)
+        rig.send("env1", 9, 9, incarnation=8, begin=6)
+        rig.send("env1", 0, 3, incarnation=9, begin=16)
+        return rig
+
+    first = send(Fleet(run_dir, at=20))
     commits = iter([None, None])  # when it met the world, and the first part
 
     def commit(one: Intakes, course: Course) -> None:
@@ -71,15 +86,62 @@ def test_killed_between_two_parts_of_what_came(run_dir: RunDir, monkeypatch: pyt
         patch.setattr(Intakes, "commit", commit)
         with pytest.raises(Killed):
             first.learner.catch_up()
-    assert first.counts("learned") == (23 - 3, 7, 7, 6)
-    assert first.counts("received") == (0,) * 4  # the log is ahead of the replay
-    second = Fleet(run_dir, at=20)
-    for env in ENVS:
-        second.send(env, 0, 19)
+    counts = {
+        "received": (23, 8, 7, 8),
+        "learned": (18, 7, 4, 7),  # of env1 1, 2, 5 and 7
+        "gaps": (1, 0, 1, 0),
+        "broken": (1, 0, 1, 0),
+        "duplicate": (0, 0, 0, 0),
+    }
+    assert {name: first.counts(name) for name in COUNTED} == counts
+    second = send(Fleet(run_dir, at=20))
     second.learner.catch_up()
-    assert [counted(run_dir, f"learned.{env}") for env in ENVS] == [19, 19, 19]
-    assert held(run_dir).added == 57
-    assert second.counts("duplicate") == (23, 8, 8, 7)
+    assert [counted(run_dir, f"learned.{env}") for env in ENVS] == [19, 13, 19]
+    assert held(run_dir).added == counted(run_dir, "learned") == 19 + 13 + 19
+    assert second.counts("duplicate") == (23, 8, 7, 8)
+    assert (second.counts("gaps"), second.counts("broken")) == ((1, 0, 1, 0), (1, 0, 1, 0))
+    assert second.counts("received") == (58, 20, 18, 20)
+
+
+def test_killed_while_it_counts_the_totals_are_those_of_all(
+    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Fleet(run_dir)
+    first.all_live(0, 9)
+
+    def count(ledger: Ledger, name: str, number: int) -> None:
+        if name == "learned":
+            raise Killed
+        whole(ledger, name, number)
+
+    whole = Ledger.set_counter
+    with monkeypatch.context() as patch:
+        patch.setattr(Ledger, "set_counter", count)
+        with pytest.raises(Killed):
+            first.all_live(10, 10)
+    assert first.counts("learned") == (27, 10, 10, 10)
+    Fleet(run_dir, at=11).all_live(11, 14)
+    assert [counted(run_dir, f"learned.{env}") for env in ENVS] == [14, 14, 14]
+    assert counted(run_dir, "learned") == 42
+
+
+def test_what_one_learned_in_memory_alone_is_no_debt_of_the_others(
+    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine transitions of env0 were counted and not kept; they do not come again, five of env1 do come."""
+    first = Fleet(run_dir)
+    first.all_live(0, 11)
+    store = first.learner.keeper._replay
+    assert store is not None and store._store is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(MappedColumns, "back", full)
+        store._store._backed = 0
+        first.all_live(12, 20, ["env0"])
+    assert first.counts("learned") == (42, 20, 11, 11)
+    second = Fleet(run_dir, at=21)
+    second.send("env1", 12, 16)
+    second.learner.catch_up()
+    assert second.counts("learned") == (5, 0, 5, 0)
 
 
 # -- the place in the logs
@@ -113,8 +175,14 @@ def test_a_note_of_other_environments_is_refused(run_dir: RunDir) -> None:
 
 def test_a_replay_of_a_single_environment_is_refused(run_dir: RunDir) -> None:
     note(run_dir, Place.beginning(["env0"]).encode(), envs=1)
-    with pytest.raises(ConfigError, match="'refuse'"):
+    with pytest.raises(ConfigError, match=r"'refuse'.*envs 1 \(wanted 3\)$"):
         Fleet(run_dir).all_live(0, 0)
+
+
+def test_a_replay_of_several_is_refused_by_a_learner_of_one(run_dir: RunDir) -> None:
+    note(run_dir, Place.beginning(ENVS).encode())
+    with pytest.raises(ConfigError, match=r"'refuse'.*envs 3 \(wanted 1\)$"):
+        start(run_dir).live(0, 0)
 
 
 def test_the_places_of_16_environments_have_room(run_dir: RunDir) -> None:

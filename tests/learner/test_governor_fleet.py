@@ -82,3 +82,41 @@ def test_both_are_judged_by_when_the_learner_worked() -> None:
         if decision is not None:
             break
     assert decision is not None and decision.power == Power(1) and "would not help" in decision.text
+
+
+# -- the learner works in every fourth tick; env0 is as tight without it, in every seventh, env1 is tight
+# beside it alone
+
+
+def beside_little_work(fleet: Fleet, n: int) -> tuple[Step, Step, int]:
+    """The n-th ticks of both, and when they are over."""
+    due_ns = fleet.work(busy=n % 4 == 0)
+    env0 = fleet.step("env0", loop_ms=8.5 if n % 7 == 0 else 2.0)
+    return env0, fleet.step("env1", loop_ms=8.5 if n % 4 == 0 else 2.0), due_ns
+
+
+def test_whom_it_helps_comes_before_whom_it_does_not() -> None:
+    """200 ticks of both at once, 50 of them beside the learner: of env0 7 of those are tight and 21 of the
+    others, of env1 50 and none."""
+    fleet, due_ns = Fleet(), 0
+    steps: list[Step] = []
+    for n in range(1, 201):
+        env0, env1, due_ns = beside_little_work(fleet, n)
+        steps += [env0, env1]
+    decision = fleet.governor.feed(steps, due_ns)
+    assert decision is not None and decision.power == HALF and "would not help" not in decision.text
+
+
+def test_what_was_given_up_for_one_is_not_taken_back_for_another_whom_it_does_not_help() -> None:
+    """Six tight ticks of env1 a level; then there is no less, and env0 has evidence. It counts alone once
+    nothing has come of env1 for 5 s."""
+    fleet, decided = Fleet(), list[tuple[int, Decision]]()
+    for n in range(1, 1201):
+        env0, env1, due_ns = beside_little_work(fleet, n)
+        for step in (env0,) if n > 600 else (env0, env1):
+            decision = fleet.governor.feed([step], due_ns)
+            decided += [] if decision is None else [(n, decision)]
+    assert [(n, decision.power) for n, decision in decided] == [
+        (24, HALF), (48, Power(1, 0.25)), (72, Power(1, 0.125)), (1100, Power(1)),
+    ]  # fmt: skip
+    assert "would not help" in decided[-1][1].text

@@ -80,6 +80,8 @@ def test_other_shapes_and_damage_are_refused(tmp_path: Path) -> None:
     Marks.open(path, SHAPE, ROOM)
     with pytest.raises(MarksError, match=r"schema 3 \(wanted 4\), capacity 4 \(wanted 5\)$"):
         Marks.open(path, {"schema": 4, "capacity": 5}, ROOM)
+    with pytest.raises(MarksError, match=r"envs 1 \(wanted 2\)$"):  # before the size that follows from it
+        Marks.open(path, SHAPE | {"envs": 2}, 2 * ROOM)
     with pytest.raises(MarksError, match="bytes"):
         Marks.open(path, SHAPE, ROOM + 1)
     path.write_bytes(path.read_bytes()[:512] + bytes(path.stat().st_size - 512))

@@ -34,5 +34,5 @@ def test_a_replay_that_does_not_fit_ends_it_with_the_difference_and_exit_code_2(
     assert line.startswith(
         "learner: learner.on_mismatch = 'refuse': must be 'fresh' to set aside what does not fit"
     )
-    assert line.endswith("schema 2 or older (wanted 3)")
+    assert line.endswith("schema 2 or older (wanted 4)")
     assert [path.name for path in (run.learner_dir / "replay").iterdir()] == ["cursor.json"]

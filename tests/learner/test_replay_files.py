@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from learner import store
 from learner.columns import MappedColumns
+from learner.marks import Marks
 from learner.replay import Replay, ReplayError, make_batch, open_replay
 from learner.store import MARGIN
 
@@ -106,7 +107,15 @@ def test_a_replay_of_another_shape_is_refused_and_stays(tmp_path: Path) -> None:
 
 def test_an_older_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cursor.json").write_text("{}")
-    with pytest.raises(ReplayError, match=r"schema 2 or older \(wanted 3\)"):
+    with pytest.raises(ReplayError, match=r"schema 2 or older \(wanted 4\)"):
+        reopened(tmp_path)
+
+
+def test_a_replay_of_one_environment_without_a_name_is_refused(tmp_path: Path) -> None:
+    """As version 3 had it, which fits in all else."""
+    shape = {"schema": 3, "capacity": 4, "observation_dim": 2, "action_dim": 1}
+    Marks.open(tmp_path / "marks.bin", shape, 4096 + 4 * 2)
+    with pytest.raises(ReplayError, match=r"schema 3 \(wanted 4\)$"):
         reopened(tmp_path)
 
 
