@@ -23,12 +23,10 @@ if a count does not reconcile. Missed and skipped deadlines are told; they are t
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -41,12 +39,12 @@ from numpy.typing import NDArray
 from benchmarks.harness import ROOT, BenchmarkError, world, write_result
 from benchmarks.memory import Sample, Sampler
 from env_server.worlds.period import num_ticks
+from launcher.child_run import started
 from launcher.stealing import StealMeter
 from launcher.summary import Summary, discrepancies
 from rtcore import cast, epoch
 from rtcore.config import RunConfig
 from rtcore.config_check import check
-from rtcore.config_io import dump_toml
 from rtcore.realtime import Rt
 from rtcore.run_dir import RunDir
 
@@ -185,24 +183,6 @@ def problems(summary: Summary, num_ticks: int) -> list[str]:
     return found + [f"{name}: {count}" for name, count in counted.items() if count]
 
 
-@contextmanager
-def launched(config: RunConfig, path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`tenuto run` of that configuration; killed at the end if it still runs."""
-    with tempfile.NamedTemporaryFile(suffix=".toml") as file, path.with_suffix(".out").open("wb") as output:
-        file.write(dump_toml(config).encode())
-        file.flush()
-        command = [sys.executable, "-m", "launcher", "run", "--config", file.name, "--run-dir", str(path)]
-        child = subprocess.Popen(
-            command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-        )
-        try:
-            yield child
-        finally:
-            if child.poll() is None:
-                child.kill()  # its processes end when it does
-                child.wait()
-
-
 def soak(config: RunConfig, path: Path) -> dict[str, Any]:
     """Run it to its end; everything that is to be told of it.
 
@@ -210,17 +190,19 @@ def soak(config: RunConfig, path: Path) -> dict[str, Any]:
         BenchmarkError: there is no summary.
     """
     steal, limit_s = StealMeter(), time.monotonic() + config.duration_s + END_LIMIT_S
-    with launched(config, path) as child:
+    said = path.with_suffix(".out")
+    with said.open("wb") as output, started(config, path, output=output, cwd=ROOT) as child:
         every_s = min(SAMPLE_S, config.duration_s / LEAST_SAMPLES)
         sampler = Sampler(psutil.Process(child.pid), "launcher", every_s)
         while child.poll() is None and time.monotonic() < limit_s:
             sampler.poll()
             time.sleep(POLL_S)
-    output = path.with_suffix(".out").read_text(errors="replace")
     run_dir = RunDir(path)
     beginning = epoch.read(run_dir.epoch_path) if run_dir.path.exists() else None
     if beginning is None or not run_dir.summary_path.exists():
-        raise BenchmarkError(f"tenuto run ended with code {child.returncode}: {output[-3000:]}")
+        raise BenchmarkError(
+            f"tenuto run ended with code {child.returncode}: {said.read_text(errors='replace')[-3000:]}"
+        )
     summary = json.loads(run_dir.summary_path.read_text())
     recording = run_dir.recording_path
     return {

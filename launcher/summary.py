@@ -69,15 +69,7 @@ def summarise(
         "clock": clock,
         "ended": ended,
         "forced": list(forced),
-        "ticks": env.counters["ticks"],
-        "resets": env.counters["resets"],
-        "episodes": env.counters["episodes"],
-        "mean_return": fmean(env.returns) if env.returns else None,
-        "returns": env.returns,
-        "deadlines": _deadlines(env),
-        "pacing_error_us": env.quantiles("pacing", 1e-3),
-        "reaction_us": totals[AGENT].quantiles("reaction", 1e-3),
-        "loop_us": env.quantiles("loop", 1e-3),
+        **_world(env, totals[AGENT]),
         "policies": _policies(learner, totals[AGENT], stats.get(LEARNER, ()), list(became.values())),
         "windows": _windows(learner.windows),
         "operator_holds": learner.counters["operator_holds"],
@@ -94,6 +86,20 @@ def summarise(
         return found
     found["transitions"]["unread"] = learner.counters["unread"]
     return found | {"envs": fleet.rows(config, processes, became, restarts)}
+
+
+def _world(env: Totals, agent: Totals) -> Summary:
+    return {
+        "ticks": env.counters["ticks"],
+        "resets": env.counters["resets"],
+        "episodes": env.counters["episodes"],
+        "mean_return": fmean(env.returns) if env.returns else None,
+        "returns": env.returns,
+        "deadlines": _deadlines(env),
+        "pacing_error_us": env.quantiles("pacing", 1e-3),
+        "reaction_us": agent.quantiles("reaction", 1e-3),
+        "loop_us": env.quantiles("loop", 1e-3),
+    }
 
 
 def _messages(totals: Collection[Totals]) -> Summary:

@@ -6,11 +6,8 @@ import json
 import os
 import signal
 import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,13 +20,13 @@ from launcher.chaos.faults import Done, Execution, Lives, Victims
 from launcher.chaos.judge import judge
 from launcher.chaos.plan import Fault, Kind, parse_kinds, plan
 from launcher.chaos.report import as_json, render
+from launcher.child_run import started
 from launcher.cli import DONE, FAILED, INTERRUPTED, CommandError
 from launcher.parsing import HELP_FLAGS, given, value_after
 from launcher.run import default_path
 from launcher.supervisor import Interrupts
 from rtcore import cast, epoch
 from rtcore.config import ConfigError, RunConfig
-from rtcore.config_io import dump_toml
 from rtcore.files import write_atomic
 from rtcore.monotonic import MonotonicClock
 from rtcore.run_dir import RunDir
@@ -150,7 +147,7 @@ def _attached(argv: Sequence[str], path: Path) -> int:
 def _run(config: RunConfig, path: Path, faults: Sequence[Fault], interface: str) -> Attack:
     """Start `tenuto run`, break it, wait for its end."""
     interrupts = Interrupts()
-    with interrupts.counted(), _started(config, path) as child:
+    with interrupts.counted(), started(config, path) as child:
 
         def going_on() -> bool:
             return child.poll() is None and not interrupts.count
@@ -169,23 +166,6 @@ def _run(config: RunConfig, path: Path, faults: Sequence[Fault], interface: str)
     if not run_dir.config_path.is_file():
         raise CommandError(f"there was no run (exit code {code})")
     return Attack(run_dir, done, ended=True, interrupted=bool(interrupts.count), code=code)
-
-
-@contextmanager
-def _started(config: RunConfig, path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`tenuto run` with that configuration; whatever becomes of us, it does not go on."""
-    with tempfile.NamedTemporaryFile(suffix=".toml") as file:
-        file.write(dump_toml(config).encode())
-        file.flush()
-        command = [sys.executable, "-m", "launcher", "run", "--config", file.name, "--run-dir", str(path)]
-        # In a process group of its own: a Ctrl-C is ours, and we pass on the first two.
-        child = subprocess.Popen(command, process_group=0, stdin=subprocess.DEVNULL)
-        try:
-            yield child
-        finally:
-            if child.poll() is None:
-                child.kill()  # its processes end when it does
-                child.wait()
 
 
 def _ended(child: subprocess.Popen[bytes], interrupts: Interrupts) -> int | None:
