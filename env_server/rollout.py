@@ -124,9 +124,8 @@ class Rollout:
         self._episode += 1
         self._episode_tick = 0
         self._return = 0.0
-        seeds = np.random.SeedSequence(
-            [self._seed, WORLD_STREAM, self._episode, self._number]
-        )  # of 0 the same
+        # A last 0 changes nothing.
+        seeds = np.random.SeedSequence([self._seed, WORLD_STREAM, self._episode, self._number])
         observation = self._world.reset(int(seeds.generate_state(1)[0]), t)
         verdict = self._actuation.reset(newest)
         self._ended = broken = not np.isfinite(observation).all()

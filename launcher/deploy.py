@@ -18,8 +18,8 @@ from launcher.parsing import HELP_FLAGS, given
 from launcher.supervisor import ENDING_LIMIT_S
 from launcher.vitals import START_NS
 from rtcore import cast
-from rtcore.cast import PER_ENV, Part
-from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
+from rtcore.cast import Part
+from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PER_ENV, PROCESSES, RECORDER
 from rtcore.config import ConfigError, RunConfig, SuperviseConfig
 
 IMAGE = "tenuto:latest"

@@ -26,7 +26,6 @@ MAX_EVENT_TEXT = 1_000  # characters; a ledger cuts at 500
 MAX_TICK = 1 << 40  # 35 years at 1 kHz
 MAX_BOUND = 1e30  # of an action: its square is not far from what float32 can hold
 MAX_BATCH_STEPS = 10_000
-NUMBERED = ("env_server", "agent_service")  # `rtcore.cast.PER_ENV`, which cannot be imported here; at most 16
 # What makes the environments of a fleet the same task: what was learned in one holds in the others.
 _TASK = (
     "tick_ns", "unit_ns", "observation_dim", "action_dim", "states", "actions", "action_low", "action_high",
@@ -108,11 +107,13 @@ def check_notice(notice: WindowNotice) -> None:
     _within("hold_units", notice.hold_units or 0, 0, MAX_TICK)
 
 
-def check_stats(stats: Stats, speakers: Collection[str]) -> None:
-    """A ledger of one of the `speakers`, of a size that a reader can keep, whose histograms decode."""
+def check_stats(stats: Stats, speakers: Collection[str], numbered: Collection[str]) -> None:
+    """A ledger of one of the `speakers`, of which a fleet has the `numbered` up to 16 times; of a size that a
+    reader can keep, whose histograms decode.
+    """
     role, dot, index = stats.process.partition(".")  # of a fleet's process; see `rtcore.cast`
-    numbered = role in NUMBERED and re.fullmatch(r"[0-9]|1[0-5]", index)
-    if role not in speakers or (dot and not numbered):
+    one_of_several = role in numbered and re.fullmatch(r"[0-9]|1[0-5]", index)
+    if role not in speakers or (dot and not one_of_several):
         raise ValueError(f"process = {_short(stats.process)}: is none of ours")
     for table in (stats.counters, stats.gauges, stats.histograms):
         if len(table) > MAX_NAMES:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from rtcore.channels import AGENT, ENV_SERVER, PROCESSES
+from rtcore.channels import PER_ENV, PROCESSES
 from rtcore.config import ConfigError, EnvConfig, RunConfig
 
-PER_ENV = (ENV_SERVER, AGENT)  # roles that a fleet has once for each environment
 _DIGITS = "0123456789"
 
 

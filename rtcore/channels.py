@@ -17,6 +17,7 @@ MessageT = TypeVar("MessageT", bound=messages.Message)
 
 ENV_SERVER, AGENT, LEARNER, RECORDER = "env_server", "agent_service", "learner", "recorder"
 PROCESSES = (ENV_SERVER, AGENT, LEARNER, RECORDER)  # in connect order: each connects to the earlier ones
+PER_ENV = (ENV_SERVER, AGENT)  # a fleet has these once for each environment
 LAUNCHER = "launcher"
 
 
@@ -91,7 +92,7 @@ WINDOW = Channel(
 )  # fmt: skip
 STATS = Channel(
     "stats", "stats/{name}", messages.Stats, Delivery.TELEMETRY, 4, 2.0, 1 << 20, True, _ALL,
-    partial(admission.check_stats, speakers=_ALL),
+    partial(admission.check_stats, speakers=_ALL, numbered=PER_ENV),
 )  # fmt: skip
 
 TABLE = (SPEC, STEP, LOG, ACTION, POLICY, WINDOW, STATS)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 # What one tick of a pair takes of a core: 0.34 ms with four pairs at 500 Hz on two quiet cores, twice that
 # beside a full load.
 TICK_S = 400e-6
-# How much of a core is promised. Four pairs at 500 Hz beside a full load missed 41 % of their deadlines and
-# lost a third of them on one core, where the promise was 0.8, and on two cores, 0.4 each, missed 1.4 %.
+# How much of a core is promised. Beside a full load, four pairs at 500 Hz lost 38 % of their deadlines on one
+# core, which is 0.8 by this reckoning, and missed nearly all others; on two cores, 0.4 each, they lost less
+# than 1 %, and missed 1 to 25 %.
 PROMISED = 0.5
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from rtcore.channels import PROCESSES
 from rtcore.config import ConfigError
 
-# The kernel takes 107 bytes for a unix socket's path; 100 leaves room for a longer name than today's.
+# The kernel takes 107 bytes for a unix socket's path; 100 leaves room for a fleet's, 2 to 3 longer.
 SOCKET_PATH_BYTES = 100
 # Fixed rather than $TMPDIR: all processes of a run must find the same directory, whoever started them.
 TEMP = Path("/tmp")
@@ -62,9 +62,7 @@ def path_for(run: Path) -> Path:
     # Resolved: processes that were given the run by different paths must come to the same answer.
     home = run.resolve()
     near = home / "link"
-    longest = max(
-        len(os.fsencode(near / f"{process}.sock")) for process in PROCESSES
-    )  # a fleet's: 2 to 3 more
+    longest = max(len(os.fsencode(near / f"{process}.sock")) for process in PROCESSES)
     if longest <= SOCKET_PATH_BYTES and re.fullmatch(r"[A-Za-z0-9_./+-]+", str(near)):
         return near
     digest = hashlib.sha256(os.fsencode(home)).hexdigest()[:16]

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rtcore.cast import PER_ENV
-from rtcore.channels import ALIVE_KEY, CONTROL_KEY, LAUNCHER, TABLE
+from rtcore.channels import ALIVE_KEY, CONTROL_KEY, LAUNCHER, PER_ENV, TABLE
 from rtcore.signing import OPERATOR, ROLES
 
 FLUSH_KEY = "flush"  # query, empty reply: all that was sent to this process before has arrived

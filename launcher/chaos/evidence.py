@@ -17,8 +17,8 @@ from launcher.chaos.faults import Done
 from launcher.report import load
 from launcher.summary import Summary
 from learner import marks
-from rtcore.cast import PER_ENV, Part, env_names, of_role, role_of
-from rtcore.channels import AGENT, LEARNER, RECORDER
+from rtcore.cast import Part, env_names, of_role, role_of
+from rtcore.channels import AGENT, LEARNER, PER_ENV, RECORDER
 from rtcore.config import ConfigError
 from rtcore.run_dir import RunDir
 

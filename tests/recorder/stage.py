@@ -14,6 +14,7 @@ from rtcore import channels
 from rtcore.clock import VirtualClock
 from rtcore.config import DriftConfig, EnvConfig, RecorderConfig, RunConfig
 from rtcore.ledger import Ledger
+from rtcore.lifecycle import Stop
 from rtcore.memory_bus import MemoryHub
 from rtcore.messages import Architecture, Event, Policy, Spec, Stats, Step, StepBatch, WindowNotice
 from rtcore.run_dir import RunDir
@@ -185,3 +186,12 @@ def run(stage: Stage, steps: list[Step]) -> None:
     stage.spec.put(SPEC)
     stage.steps(steps, last=True)
     stage.service.close()
+
+
+def drain(stage: Stage) -> int:
+    """Stop the recorder; how many ns it waits for the others' last words."""
+    stop = Stop()
+    stop.set("test")
+    begin_ns = stage.clock.now_ns()
+    stage.service.run(stop)
+    return stage.clock.now_ns() - begin_ns

@@ -10,7 +10,6 @@ import pytest
 import recorder.service
 from recorder import reading
 from recorder.finish import FinishError, run_cli
-from rtcore.lifecycle import Stop
 from rtcore.messages import Event, Step, StepBatch
 from tests.recorder.stage import (
     CONFIG,
@@ -20,6 +19,7 @@ from tests.recorder.stage import (
     TICK,
     UNIT,
     come_back,
+    drain,
     make_stats,
     make_step,
     run,
@@ -227,11 +227,7 @@ def test_after_the_stop_it_waits_for_last_words_up_to_two_seconds(
     if final:
         stage.stats(make_stats("learner", 1, T0, final=True))
         stage.service.poll()
-    stop = Stop()
-    stop.set("test")
-    begin_ns = stage.clock.now_ns()
-    stage.service.run(stop)
-    assert stage.clock.now_ns() - begin_ns == pytest.approx(waited_s * 1e9, abs=50 * MS)
+    assert drain(stage) == pytest.approx(waited_s * 1e9, abs=50 * MS)
 
 
 def test_closing_twice_does_nothing(tmp_path: Path) -> None:
