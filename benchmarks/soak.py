@@ -258,7 +258,8 @@ def table(result: dict[str, Any]) -> str:
     lines.append(
         f"\n{summary['learner']['gradient_steps']} gradient steps; recorder {summary['recorder']}, "
         f"{result['recording_mb']:.0f} MB on disk; rejected {summary['messages']['rejected']}; "
-        f"restarts {sum(summary['restarts'].values())}"
+        f"restarts {sum(summary['restarts'].values())}; "
+        f"silences for want of a core {sum(one['what'] == 'starved' for one in summary['supervision'])}"
     )
     flat = all(row["verdict"] == "flat" for row in result["memory"].values())
     memory = "memory flat" if flat else "too short to tell whether memory is flat"

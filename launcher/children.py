@@ -49,6 +49,10 @@ class Children:
         assert self._starter is not None, "inside `kept` only"
         self._children[name] = self._starter.submit(self._popen, name).result()
 
+    def pid(self, name: str) -> int:
+        """The number of its life, which may be over."""
+        return self._children[name].pid
+
     def running(self) -> frozenset[str]:
         """Who runs."""
         return frozenset(name for name, child in self._children.items() if child.poll() is None)

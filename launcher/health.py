@@ -12,6 +12,7 @@ from tyro.conf import Positional
 from launcher.chaos.faults import Lives
 from launcher.cli import DONE, CommandError
 from launcher.parsing import parse
+from launcher.run_delay import RunDelay
 from launcher.vitals import START_NS
 from rtcore import cast, channels
 from rtcore.bus import Bus, BusError
@@ -35,7 +36,8 @@ class HealthOptions:
     run_dir: Path | None = None
     """The run directory."""
     kill_stuck: bool = False
-    """Kill it if it is stuck, so that whoever supervises it starts it again; not in its first 60 s."""
+    """Kill it if it is stuck, so that whoever supervises it starts it again; not in its first 60 s, nor if it
+    waited for a core for most of the time."""
 
 
 def health(argv: Sequence[str]) -> int:
@@ -61,20 +63,28 @@ def health(argv: Sequence[str]) -> int:
             endpoints=Endpoints(connect=config.link.connect),
             secure=config.link.secure,
         ) as bus:
+            delays = [RunDelay(pid) for pid in Lives(run_dir.path).pids(chosen.process)]
+            waited_s(delays, clock)
             age_s = turned(bus, chosen.process, clock, stuck_s)
     except BusError as error:
         raise CommandError(str(error)) from error
     if age_s is None:
+        what = f"{chosen.process} has not turned for {stuck_s:g} s"
+        if (waiting_s := waited_s(delays, clock)) > stuck_s / 2:
+            raise CommandError(f"{what}, and waited for a core for {waiting_s:.1f} s")
         killed = chosen.kill_stuck and kill(run_dir.path, chosen.process)
-        raise CommandError(
-            f"{chosen.process} has not turned for {stuck_s:g} s" + (" and was killed" if killed else "")
-        )
+        raise CommandError(what + (" and was killed" if killed else ""))
     Console().print(f"{chosen.process} turned {age_s:.2f} s ago", highlight=False)
     return DONE
 
 
 def _nobody(process: str, known: Sequence[str]) -> ConfigError:
     return ConfigError("process", process, "one of " + ", ".join(known))
+
+
+def waited_s(delays: Sequence[RunDelay], clock: Clock) -> float:
+    """For how long a process, which may have gone, waited for a core since the call before."""
+    return max((delay.grown_ns(clock.now_ns()) for delay in delays), default=0) / 1e9
 
 
 def turned(bus: Bus, process: str, clock: Clock, stuck_s: float) -> float | None:

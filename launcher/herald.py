@@ -20,10 +20,17 @@ from rtcore.messages import Event, Level
 from rtcore.process import REPORT_PERIOD_S, Reporter
 
 REPEATED = 64  # a recorder that died too may need a minute to be back, on a busy machine
-LEVELS: dict[What, Level] = {"died": "WARN", "stuck": "WARN", "restarted": "INFO", "gave_up": "ERROR"}
+LEVELS: dict[What, Level] = {
+    "died": "WARN",
+    "stuck": "WARN",
+    "starved": "WARN",
+    "restarted": "INFO",
+    "gave_up": "ERROR",
+}
 COUNTERS: dict[What, str] = {
     "died": "deaths",
     "stuck": "hangs",
+    "starved": "starvations",
     "restarted": "restarts",
     "gave_up": "given_up",
 }
@@ -32,7 +39,7 @@ COUNTERS: dict[What, str] = {
 class Herald:
     """Speaks as the process "launcher", once there is something to say: then as often as the others do.
 
-    Counts `deaths`, `hangs`, `restarts` and `given_up`.
+    Counts `deaths`, `hangs`, `starvations`, `restarts` and `given_up`.
     """
 
     def __init__(self, bus: Bus, clock: Clock, incarnation: int) -> None:

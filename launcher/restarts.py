@@ -11,7 +11,7 @@ from launcher.vitals import START_NS
 from rtcore.config import SuperviseConfig
 from rtcore.process import WRONG_INPUT
 
-What = Literal["died", "stuck", "restarted", "gave_up"]
+What = Literal["died", "stuck", "starved", "restarted", "gave_up"]
 
 HUNG = "hung and was killed"
 MOST_DOUBLINGS = 60  # beyond it any first delay is above any most
@@ -24,7 +24,8 @@ class Happening:
     Attributes:
         at_ns: when, on the monotonic clock.
         process: to whom.
-        what: each death is one "died" or "stuck"; each further life one "restarted".
+        what: each death is one "died" or "stuck"; each further life one "restarted"; "starved" is a silence
+            for want of a core.
         code: the exit code, negative: the signal; None: it has none.
         text: for people.
     """

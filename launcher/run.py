@@ -150,6 +150,11 @@ def _carry_out(
                 run_dir.run_name,
                 run_dir.socket_dir(),
                 clock=clock,
+    if config.agent.rt != "off" and crew.fills(cores := len(realtime.allowed_cores())):
+        screen.say(
+            f"{crew.count} environments at {crew.hz:g} Hz with their agents go first on all {cores} cores:"
+            " learner and recorder get what they leave"
+        )
                 peers=cast.names(config),
                 secure=config.link.secure,
             ) as bus,

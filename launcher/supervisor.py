@@ -18,6 +18,7 @@ from launcher.children import Children
 from launcher.restarts import Again, GiveUp, Happening, Restarts, What, describe
 from launcher.starting import process_command
 from launcher.vitals import Vitals
+from launcher.watchdog import Watchdog
 from rtcore import channels
 from rtcore.cast import role_of
 
@@ -144,6 +145,7 @@ class Supervisor:
         self._vitals = vitals
         self._tell = tell
         self._dead: set[str] = set()  # whose death has been entered
+        self._watchdog = None if vitals is None else Watchdog(vitals, self._children.pid)
         self._due_ns: dict[str, int] = {}  # of the dead: when their next life begins
         self._hung: set[str] = set()  # killed for that, and not seen to end yet
         self._leaders = {name for name in commands if role_of(name) == role_of(next(iter(commands)))}
@@ -241,12 +243,16 @@ class Supervisor:
         return failure
 
     def _kill_stuck(self) -> None:
-        for process in [] if self._vitals is None else self._vitals.stuck(time.monotonic_ns()):
+        if self._watchdog is None:
+            return
+        for process in self._watchdog.hung(time.monotonic_ns()):
             self._hung.add(process)
             self._children.signal(process, signal.SIGKILL)
 
     def _start_due(self) -> list[Failure]:
         now_ns = time.monotonic_ns()
+        for process in self._watchdog.starving():
+            self._happened(process, "starved", None, "does not say that its loop turns: it waits for a core")
         failures: list[Failure] = []
         for process in [name for name, due_ns in self._due_ns.items() if now_ns >= due_ns]:
             del self._due_ns[process]

@@ -1,7 +1,8 @@
 """Who is stuck, by his own word: each process's stats say when its loop last turned. Pure.
 
 A process that was stopped, hangs in a lock or waits for a disk says nothing new, whatever its threads say.
-Ages are counted on the launcher's own waking time: what nobody could have heard is held against nobody.
+Ages are counted on the launcher's own waking time: what nobody could have heard is held against nobody. Nor
+is a silence for a good reason: the process waited for a core.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ START_NS = 60_000_000_000  # from a start to the first turn: learning's librarie
 LONGEST_LOOK_NS = 500_000_000
 # All processes speak four times a second each. Hearing nobody for so long, the launcher is the deaf one.
 DEAF_NS = 1_000_000_000
+# A silence of so many times the limit is a hang whatever excuses it: one thread may wait for a core for as
+# long as the machine is busy, while another one hangs.
+PATIENCE = 10
 
 
 @dataclass
@@ -28,11 +32,15 @@ class _Life:
         earlier: the greatest incarnation of its earlier lives, whose last words may still come.
         turned_ns: the launcher's waking time when it last heard of a turn, or when the life began.
         beat_ns: the newest turn, as the process stamped it; 0: none yet.
+        excused_ns: of the time since that turn, what is not held against it.
+        starved: that was told, in this silence.
     """
 
     earlier: int
     turned_ns: int
     beat_ns: int = 0
+    excused_ns: int = 0
+    starved: bool = False
 
 
 class Vitals:
@@ -43,6 +51,7 @@ class Vitals:
         self._lives: dict[str, _Life] = {}
         self._newest: dict[str, int] = {}  # incarnation of each process
         self._awake_ns = 0
+        self._passed_ns = 0  # of it, with the last look
         self._looked_ns: int | None = None
         self._heard_ns: int | None = None  # when anybody was heard
 
@@ -63,13 +72,46 @@ class Vitals:
         life = self._lives.get(stats.process)
         if life is not None and stats.incarnation > life.earlier and stats.beat_ns > life.beat_ns:
             life.beat_ns, life.turned_ns = stats.beat_ns, self._awake_ns
+            life.excused_ns, life.starved = 0, False
 
-    def stuck(self, now_ns: int) -> list[str]:
-        """Whose loop has not turned for longer than `stuck_s`, or not at all in 60 s from the start. To be
-        called many times a second, after what has come was taken in.
+    def look(self, now_ns: int) -> None:
+        """Time has passed. To be called many times a second, after what has come was taken in."""
+        since_ns = now_ns - (now_ns if self._looked_ns is None else self._looked_ns)
+        self._looked_ns = now_ns
+        deaf = self._heard_ns is None or now_ns - self._heard_ns > DEAF_NS
+        self._passed_ns = 0 if deaf else min(since_ns, LONGEST_LOOK_NS)
+        self._awake_ns += self._passed_ns
+
+    def silent(self) -> list[str]:
+        """Who should be looked at: silent for more than half of what it may be."""
+        return [name for name, life in self._lives.items() if self.silent_ns(name) > self._limit_ns(life) / 2]
+
+    def excuse(self, process: str, ns: int) -> None:
+        """So much of the time that passed with the last look is not held against it."""
+        self._lives[process].excused_ns += min(ns, self._passed_ns)
+
+    def stuck(self) -> list[str]:
+        """Whose loop has not turned for longer than `stuck_s`, or not at all in 60 s from the start, without
+        what is excused; or for ten times as long.
         """
-        self._look(now_ns)
-        return [name for name, life in self._lives.items() if self.silent_ns(name) > self._limit_ns(life)]
+        return [
+            name
+            for name, life in self._lives.items()
+            if (silent_ns := self.silent_ns(name)) - life.excused_ns > (limit_ns := self._limit_ns(life))
+            or silent_ns > PATIENCE * limit_ns
+        ]
+
+    def starving(self) -> list[str]:
+        """Who would be stuck if nothing were excused and is not; each once in a silence."""
+        stuck = self.stuck()
+        found = [
+            name
+            for name, life in self._lives.items()
+            if not life.starved and name not in stuck and self.silent_ns(name) > self._limit_ns(life)
+        ]
+        for name in found:
+            self._lives[name].starved = True
+        return found
 
     def silent_ns(self, process: str) -> int:
         """For how long, in waking time, no turn of its loop was heard of."""
@@ -77,9 +119,3 @@ class Vitals:
 
     def _limit_ns(self, life: _Life) -> int:
         return self._stuck_ns if life.beat_ns else max(START_NS, self._stuck_ns)
-
-    def _look(self, now_ns: int) -> None:
-        since_ns = now_ns - (now_ns if self._looked_ns is None else self._looked_ns)
-        self._looked_ns = now_ns
-        if self._heard_ns is not None and now_ns - self._heard_ns <= DEAF_NS:
-            self._awake_ns += min(since_ns, LONGEST_LOOK_NS)

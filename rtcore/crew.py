@@ -34,5 +34,9 @@ class Crew:
         wanted = math.ceil(self.count * self.hz * TICK_S / PROMISED)
         return max(1, min(wanted, self.count, available))
 
+    def fills(self, available: int) -> bool:
+        """Whether the pairs have each of several cores, so that none is left for learning alone."""
+        return 1 < available == self.cores(available)
+
 
 ALONE = Crew()

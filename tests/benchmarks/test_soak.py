@@ -34,6 +34,7 @@ def summary(**changes: Any) -> dict[str, Any]:
         "disk": {"transitions": 0, "rows": 0},
         "messages": {"rejected": 0, "denied": 0},
         "restarts": {"env_server": 0, "learner": 0},
+        "supervision": [{"at_s": 1.0, "process": "learner", "what": "starved", "code": None}],
         "forced": [],
         "envs": {"env0": dict(ENV), "env1": dict(ENV)},
     }
@@ -173,6 +174,7 @@ def test_the_result_has_a_verdict_for_everybody(monkeypatch: pytest.MonkeyPatch)
     assert told["series"]["learner"][0] == [90.0, 100 * MB, 100 * MB]
     text = table(told)
     assert "agent_service.3" in text
+    assert "silences for want of a core 1\n" in text
     assert text.endswith("1800000 deadlines")
     assert table(told | {"wrong": []}).endswith("nothing dropped, memory flat")
     told["memory"]["learner"]["verdict"] = "too short"

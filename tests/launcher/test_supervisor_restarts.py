@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from launcher import run_delay
 from launcher.children import Children
 from launcher.restarts import Happening, Restarts
+from launcher.run_delay import Thread
 from launcher.supervisor import End, Interrupts, Supervisor
 from launcher.vitals import Vitals
 from rtcore.channels import AGENT, ENV_SERVER, LEARNER, PROCESSES, RECORDER
@@ -154,6 +156,28 @@ def test_who_is_stuck_is_killed_and_lives_again(tmp_path: Path) -> None:
     assert whats(told, AGENT) == [("stuck", -signal.SIGKILL), ("restarted", None)]
     assert {one.process for one in told} == {AGENT}
     assert told[0].text == "agent_service hung and was killed; it is started again in 0.05 s"
+
+
+def test_who_waits_for_a_core_is_told_of_and_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vitals, began_ns = Vitals(1.0), time.monotonic_ns()
+
+    def read(number: int) -> dict[str, Thread]:
+        return {str(number): Thread(time.monotonic_ns(), time.monotonic_ns(), runnable=True)}
+
+    monkeypatch.setattr(run_delay, "read", read)
+
+    def look(interrupts: Interrupts, told: list[Happening]) -> None:
+        now_ns = time.monotonic_ns()
+        interrupts.count = int(bool(told) or now_ns - began_ns > 10_000_000_000)
+        for process in PROCESSES:
+            beat_ns = began_ns + 1 if process == AGENT else now_ns
+            vitals.heard(ledger(process, beat_ns=beat_ns), now_ns)
+
+    end, told = carry_on(tmp_path, {}, QUICK, look, vitals)
+    assert end == End("interrupted")
+    assert [(one.process, one.what, one.code) for one in told] == [(AGENT, "starved", None)]
+    assert told[0].text == "agent_service does not say that its loop turns: it waits for a core"
+    assert ended(tmp_path) == list(PROCESSES)  # in order, all of them by themselves
 
 
 def test_who_cannot_be_started_has_died(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from launcher.vitals import START_NS, Vitals
+from launcher.vitals import PATIENCE, START_NS, Vitals
 from rtcore.channels import AGENT, ENV_SERVER, LAUNCHER, LEARNER
 from rtcore.messages import Stats
 from tests.launcher.ledgers import ledger
@@ -15,7 +15,7 @@ class Watched:
     def __init__(self) -> None:
         self.vitals = Vitals(2.0)
         self.now_ns = 1000 * SECOND
-        self.vitals.stuck(self.now_ns)
+        self.vitals.look(self.now_ns)
 
     def look(self, *beating: str, seconds: float, incarnation: int = 1) -> list[str]:
         """So many seconds of looks; who was found stuck at the last."""
@@ -24,7 +24,8 @@ class Watched:
             self.now_ns += LOOK
             for process in beating:
                 self.hear(said(process, self.now_ns, incarnation))
-            found = self.vitals.stuck(self.now_ns)
+            self.vitals.look(self.now_ns)
+            found = self.vitals.stuck()
         return found
 
     def hear(self, stats: Stats) -> None:
@@ -104,3 +105,60 @@ def test_each_process_of_a_fleet_is_watched_for_itself() -> None:
     assert watched.look(first, seconds=2.5) == [second]
     watched.vitals.gone(second)
     assert watched.look(first, seconds=5) == []
+
+
+def starved(process: str, seconds: float, watched: Watched, share: float = 1.0) -> list[str]:
+    """So many seconds of looks, of each of which the process waited for a core for a share; who is stuck."""
+    found: list[str] = []
+    for _ in range(round(seconds * 20)):
+        watched.look(ENV_SERVER, seconds=0.05)
+        if process in watched.vitals.silent():
+            watched.vitals.excuse(process, round(share * LOOK))
+        found = watched.vitals.stuck()
+    return found
+
+
+def test_what_is_excused_is_not_held_against_it() -> None:
+    watched = Watched()
+    for process in (ENV_SERVER, LEARNER):
+        watched.vitals.started(process)
+    watched.look(ENV_SERVER, LEARNER, seconds=1)
+    # After k looks it has been silent for k + 1, and half of each is excused from the 20th on: at k = 59 that
+    # leaves 60 - 40 / 2 = 40, the limit.
+    assert starved(LEARNER, 2.95, watched, share=0.5) == []
+    assert starved(LEARNER, 0.05, watched, share=0.5) == [LEARNER]
+
+
+def test_who_starves_is_told_once_in_a_silence() -> None:
+    watched = Watched()
+    for process in (ENV_SERVER, LEARNER):
+        watched.vitals.started(process)
+    for _ in range(2):
+        watched.look(ENV_SERVER, LEARNER, seconds=1)
+        assert starved(LEARNER, 1.95, watched) == []
+        assert watched.vitals.starving() == []  # 2 s are allowed
+        assert starved(LEARNER, 0.05, watched) == []
+        assert watched.vitals.starving() == [LEARNER]
+        assert starved(LEARNER, 3.0, watched) == []
+        assert watched.vitals.starving() == []  # it has been told
+
+
+def test_patience_has_an_end() -> None:
+    watched = Watched()
+    for process in (ENV_SERVER, LEARNER):
+        watched.vitals.started(process)
+    watched.look(ENV_SERVER, LEARNER, seconds=1)
+    assert starved(LEARNER, 2.0 * PATIENCE - 0.05, watched) == []
+    assert starved(LEARNER, 0.05, watched) == [LEARNER]
+    assert watched.vitals.starving() == []
+
+
+def test_no_more_is_excused_than_has_passed_for_the_launcher() -> None:
+    watched = Watched()
+    for process in (ENV_SERVER, LEARNER):
+        watched.vitals.started(process)
+    watched.look(ENV_SERVER, LEARNER, seconds=1)
+    watched.look(ENV_SERVER, seconds=1.5)
+    watched.vitals.excuse(LEARNER, 100 * SECOND)  # one look: 50 ms
+    assert watched.look(ENV_SERVER, seconds=0.5) == []
+    assert watched.look(ENV_SERVER, seconds=0.05) == [LEARNER]

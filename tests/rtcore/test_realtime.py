@@ -243,6 +243,7 @@ def test_a_process_that_is_nicer_already_stays_so() -> None:
 )
 def test_a_fleet_shares_as_few_cores_as_carry_it(count: int, hz: float, available: int, cores: int) -> None:
     assert Crew(0, count, hz).cores(available) == cores
+    assert Crew(0, count, hz).fills(available) is ((count, hz, available) == (4, 500.0, 2))
 
 
 def test_pairs_of_a_fleet_are_dealt_to_its_cores_and_the_others_keep_off() -> None:
