@@ -11,16 +11,22 @@ the new life that goes by an older one is counted.
 `remote`: there is a learner, its file is on another host, and the agent has its own copy.
 `bus`: there is a learner and no file at all. Here this process stands in for the learner.
 
-Most of the time goes into loading; without a bytecode cache (PYTHONDONTWRITEBYTECODE) it takes 0.1 s more.
+With `--spare` every other life is that of a spare, which has waited loaded, as under `tenuto run`; counted is
+from right before it gets its order. So both kinds of lives have the same machine in the same minutes.
+
+Without a spare most of the time goes into loading; without a bytecode cache (PYTHONDONTWRITEBYTECODE) it
+takes 0.1 s more.
 """
 
 from __future__ import annotations
 
+import math
+import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +37,8 @@ import numpy as np
 import tyro
 
 from benchmarks.harness import BenchmarkError, random_policy, world, write_result
+from launcher.children import Children
+from launcher.starting import spare_command
 from launcher.stealing import StealMeter
 from launcher.supervisor import command_for
 from rtcore import channels
@@ -47,6 +55,7 @@ ARMS: tuple[Arm, ...] = ("alive", "dead", "remote", "bus")
 LIMIT_S = 10.0
 SETTLE_S = 0.4  # between two acts: published and adopted, killed and noticed
 LIVED_S = 0.3  # of the new life's answers are looked at
+LOADED_S = 1.5  # after its start a spare has loaded everything
 AHEAD = ("chrt", "--rr", "1")
 PACKAGES = ("eclipse-zenoh", "numpy")
 
@@ -61,6 +70,7 @@ class Arguments:
     hz: float = 200.0
     hidden: tuple[int, ...] = (256, 256)
     rt: Rt = "auto"
+    spare: bool = False  # every other life is a spare's
     ahead: bool = False  # the agent loads ahead of what else the machine does (SCHED_RR 1, by `chrt`)
     out: Path = Path("benchmarks/results")
 
@@ -99,41 +109,39 @@ class Answers:
 class Stage:
     """An env server that ticks, an agent to kill, and this process as the learner, or a mere witness."""
 
-    def __init__(self, arm: Arm, run_dir: RunDir, bus: Bus, first: Policy, prefix: Sequence[str]) -> None:
-        self._arm, self._run_dir, self._policy, self._prefix = arm, run_dir, first, prefix
+    def __init__(self, arm: Arm, run_dir: RunDir, bus: Bus, first: Policy, children: Children) -> None:
+        self._arm, self._run_dir, self._policy, self._children = arm, run_dir, first, children
         self._clock = MonotonicClock()
         self._answers = Answers(bus.queue(channels.LOG, "*"))
         self._policies = None if arm == "dead" else bus.publisher(channels.POLICY)
-        self._agent: subprocess.Popen[bytes] | None = None
 
-    def restart(self) -> dict[str, Any]:
+    def restart(self, *, spare: bool = False) -> dict[str, Any]:
         """Publish, kill, start, and wait for the first answers."""
+        if spare:
+            self._children.tend(math.inf)
+            time.sleep(LOADED_S)
         self._publish()
         time.sleep(SETTLE_S)
-        self.kill()
+        self._children.kill(self._children.running())
         if self._arm == "bus":
             self._run_dir.adopted_path(channels.AGENT).unlink(missing_ok=True)
         time.sleep(SETTLE_S)
         self._answers.read(0.1)
         skipped, self._answers.skipped = self._answers.skipped, 0
         began_ns = self._clock.now_ns()
-        command = [*self._prefix, *command_for(channels.AGENT, self._run_dir.path)]
-        self._agent = subprocess.Popen(command)
+        if self._children.start(channels.AGENT) != spare:
+            raise BenchmarkError(f"{self._arm}: the spare did not live")
         answers = self._first_answers(began_ns)
         on_policy = [one for one in answers if one.version == self._policy.version]
         return {
+            "spare": spare,
+            "load_1min": os.getloadavg()[0],
             "first_ms": (answers[0].arrived_ns - began_ns) / 1e6,
             "newest_ms": (on_policy[0].arrived_ns - began_ns) / 1e6,
             "older_answers": len(answers) - len(on_policy),
             "skipped": self._answers.skipped,
-            "skipped_before": skipped,  # in the 1.2 s without a start, for comparison
+            "skipped_before": skipped,  # in the 1.2 s without a start, for comparison; 2.7 s with a spare's
         }
-
-    def kill(self) -> None:
-        """Kill the agent, if there is one."""
-        if self._agent is not None:
-            self._agent.kill()
-            self._agent.wait()
 
     def _publish(self) -> None:
         self._policy = msgspec.structs.replace(
@@ -172,21 +180,35 @@ def staged(arguments: Arguments, arm: Arm) -> Iterator[Stage]:
         env_server = subprocess.Popen(command_for(channels.ENV_SERVER, run_dir.path))
         stack.callback(env_server.wait)
         stack.callback(env_server.terminate)
-        prefix = AHEAD if arguments.ahead else ()
-        stage = Stage(arm, run_dir, bus, random_policy(config, arguments.hidden), prefix)
-        stack.callback(stage.kill)
-        yield stage
+        command = command_for(channels.AGENT, run_dir.path)
+        children = Children(
+            {channels.AGENT: [*(AHEAD if arguments.ahead else ()), *command]},
+            run_dir.logs_dir,
+            {channels.AGENT: spare_command(command)},
+        )
+        stack.enter_context(children.kept())
+        yield Stage(arm, run_dir, bus, random_policy(config, arguments.hidden), children)
 
 
-def measure(arguments: Arguments, arm: Arm) -> dict[str, Any]:
-    """All restarts of one arm, and their quantiles in ms."""
+def measure(arguments: Arguments, arm: Arm) -> list[dict[str, Any]]:
+    """All restarts of one arm, and their quantiles in ms; of each kind of life apart."""
     steal = StealMeter()
+    kinds = (False, True) if arguments.spare else (False,)
     with staged(arguments, arm) as stage:
         stage.restart()  # the first start of all reads the program from the disk
-        rows = [stage.restart() for _ in range(arguments.restarts)]
+        rows = [stage.restart(spare=kind) for _ in range(arguments.restarts) for kind in kinds]
+    stolen_s = steal.elapsed_s()  # in all of them
+    return [
+        {"arm": arm, "spare": kind, "stolen_s": stolen_s}
+        | quantiles([row for row in rows if row["spare"] == kind])
+        for kind in kinds
+    ]
+
+
+def quantiles(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the restarts of one kind come to."""
     newest = np.array([row["newest_ms"] for row in rows])
     return {
-        "arm": arm,
         "p50_ms": float(np.quantile(newest, 0.5)),
         "p90_ms": float(np.quantile(newest, 0.9)),
         "max_ms": float(newest.max()),
@@ -194,28 +216,33 @@ def measure(arguments: Arguments, arm: Arm) -> dict[str, Any]:
         "restarts": len(rows),
         "older_answers": sum(row["older_answers"] for row in rows),
         "skipped": sum(row["skipped"] for row in rows),
-        "stolen_s": steal.elapsed_s(),
         "rows": rows,
     }
 
 
 def main(arguments: Arguments) -> None:
     """Measure, print a table, write the result."""
+    if arguments.spare and arguments.ahead:
+        raise BenchmarkError("--spare and --ahead: nobody can be started ahead who runs already")
     print(
-        f"{'arm':>8}{'p50':>9}{'p90':>9}{'max':>9} ms{'<= 300 ms':>12}{'on an older one':>17}{'skipped':>9}"
+        f"{'arm':>14}{'p50':>9}{'p90':>9}{'max':>9} ms{'<= 300 ms':>12}{'on an older one':>17}{'skipped':>9}"
     )
     found = []
     for arm in arguments.arms:
-        one = measure(arguments, arm)
-        found.append(one)
-        share = f"{one['within_300_ms']}/{one['restarts']}"
-        print(
-            f"{arm:>8}{one['p50_ms']:9.0f}{one['p90_ms']:9.0f}{one['max_ms']:9.0f}{share:>15}"
-            f"{one['older_answers']:>15}{one['skipped']:>9}",
-            flush=True,
-        )
+        for one in measure(arguments, arm):
+            found.append(one)
+            share = f"{one['within_300_ms']}/{one['restarts']}"
+            name = arm + " spare" * one["spare"]
+            print(
+                f"{name:>14}{one['p50_ms']:9.0f}{one['p90_ms']:9.0f}{one['max_ms']:9.0f}{share:>15}"
+                f"{one['older_answers']:>15}{one['skipped']:>9}",
+                flush=True,
+            )
     write_result(
-        "agent_restart", arguments, PACKAGES, {"bytecode": not sys.dont_write_bytecode, "arms": found}
+        "agent_restart-spare" if arguments.spare else "agent_restart",
+        arguments,
+        PACKAGES,
+        {"bytecode": not sys.dont_write_bytecode, "arms": found},
     )
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+
+from launcher.spares import Spares
+from rtcore.cast import role_of
 
 TAIL_LINES = 12
 
@@ -16,9 +20,21 @@ TAIL_LINES = 12
 class Children:
     """Starts, signals and buries. What the lives of a process print is in one file, `<name>.out`."""
 
-    def __init__(self, commands: Mapping[str, Sequence[str]], output_dir: Path) -> None:
+    def __init__(
+        self,
+        commands: Mapping[str, Sequence[str]],
+        output_dir: Path,
+        spares: Mapping[str, Sequence[str]] = {},
+    ) -> None:
+        """Args:
+        commands: a command line per process.
+        output_dir: for what they print.
+        spares: a command line per role of which one process is to be in reserve.
+        """
         self._commands = dict(commands)
         self._output_dir = output_dir
+        self._spare_commands = dict(spares)
+        self._spares = Spares(spares, self._start_spare)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._starter: ThreadPoolExecutor | None = None
 
@@ -38,16 +54,24 @@ class Children:
             try:
                 yield
             finally:
+                self._spares.end()
                 self.kill(self.running())
 
-    def start(self, name: str) -> None:
-        """Begin a life.
+    def start(self, name: str) -> bool:
+        """Begin a life; says whether a spare took it on.
 
         Raises:
             OSError: the system refuses.
         """
-        assert self._starter is not None, "inside `kept` only"
-        self._children[name] = self._starter.submit(self._popen, name).result()
+        command, output = self._commands[name], self._output_dir / f"{name}.out"
+        spare = self._spares.take(role_of(name), command, output)
+        self._children[name] = spare or self._popen(command, output, subprocess.DEVNULL)
+        self._spares.began(role_of(name), time.monotonic())
+        return spare is not None
+
+    def tend(self, now_s: float) -> None:
+        """See to the spares, `now_s` by the monotonic clock. To be called many times a second."""
+        self._spares.tend(now_s)
 
     def pid(self, name: str) -> int:
         """The number of its life, which may be over."""
@@ -82,15 +106,20 @@ class Children:
             return f"(not to be read: {error})"
         return "\n".join([line for line in text.splitlines() if line.strip()][-TAIL_LINES:])
 
-    def _popen(self, name: str) -> subprocess.Popen[bytes]:
+    def _start_spare(self, role: str) -> subprocess.Popen[bytes]:
+        return self._popen(
+            self._spare_commands[role], self._output_dir / f"{role}.spare.out", subprocess.PIPE
+        )
+
+    def _popen(self, command: Sequence[str], output: Path, stdin: int) -> subprocess.Popen[bytes]:
         # One file for both streams keeps their order. A process group of its own keeps the terminal's
         # Ctrl-C from it; a session of its own would make it an autogroup of its own, against whose CPU
         # share no niceness helps.
-        with (self._output_dir / f"{name}.out").open("ab") as output:
-            return subprocess.Popen(
-                self._commands[name],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                process_group=0,
-            )
+        def popen() -> subprocess.Popen[bytes]:
+            with output.open("ab") as file:
+                return subprocess.Popen(
+                    command, stdin=stdin, stdout=file, stderr=subprocess.STDOUT, process_group=0
+                )
+
+        assert self._starter is not None, "inside `kept` only"
+        return self._starter.submit(popen).result()

@@ -20,6 +20,7 @@ from launcher.lookout import Lookout
 from launcher.mending import mend
 from launcher.restarts import Happening, Restarts
 from launcher.screen import Screen
+from launcher.starting import spare_command
 from launcher.streams import dispensable
 from launcher.summary import Summary, passed, summarise
 from launcher.supervisor import End, Interrupts, Supervisor, command_for
@@ -120,6 +121,14 @@ def _wanted(config: RunConfig) -> tuple[str, ...]:
     return cast.names(config, record=config.recorder.record)
 
 
+def _spares(config: RunConfig, run_dir: RunDir) -> dict[str, list[str]]:
+    """Of the agents, in whose absence nobody acts; none where nobody is to be started again."""
+    if config.supervise.limit == 0:
+        return {}
+    last = cast.of_role(config, channels.AGENT)[-1]  # none has a longer command line
+    return {channels.AGENT: spare_command(command_for(last, run_dir.path))}
+
+
 def _carry_out(
     config: RunConfig,
     run_dir: RunDir,
@@ -136,10 +145,16 @@ def _carry_out(
     supervisor = Supervisor(
         {name: command_for(name, run_dir.path) for name in wanted},
         run_dir.logs_dir,
+        spares=_spares(config, run_dir),
         restarts=Restarts(config.supervise),
         vitals=lookout.vitals,
         tell=lookout.happened,
     )
+    if config.agent.rt != "off" and crew.fills(cores := len(realtime.allowed_cores())):
+        screen.say(
+            f"{crew.count} environments at {crew.hz:g} Hz with their agents go first on all {cores} cores:"
+            " learner and recorder get what they leave"
+        )
     with supervisor.started():
         os.nice(NICENESS)
         with (
@@ -150,11 +165,6 @@ def _carry_out(
                 run_dir.run_name,
                 run_dir.socket_dir(),
                 clock=clock,
-    if config.agent.rt != "off" and crew.fills(cores := len(realtime.allowed_cores())):
-        screen.say(
-            f"{crew.count} environments at {crew.hz:g} Hz with their agents go first on all {cores} cores:"
-            " learner and recorder get what they leave"
-        )
                 peers=cast.names(config),
                 secure=config.link.secure,
             ) as bus,

@@ -38,3 +38,11 @@ def process_command(
             found += [name, endpoint]
     found += ["--router", router] if router else []
     return found + (["--supervised", str(supervisor)] if supervisor is not None else [])
+
+
+def spare_command(command: Sequence[str]) -> list[str]:
+    """The command line of a spare, from that of the process it is to become: longer, so that the other one
+    finds room in it, and with another module, so that nobody takes it for that process."""
+    found = list(command)
+    found[found.index("-m") + 1] += ".spare"
+    return found

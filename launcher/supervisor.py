@@ -129,6 +129,7 @@ class Supervisor:
         commands: Mapping[str, Sequence[str]],
         output_dir: Path,
         *,
+        spares: Mapping[str, Sequence[str]] = {},
         restarts: Restarts | None = None,
         vitals: Vitals | None = None,
         tell: Callable[[Happening], None] = lambda happening: None,  # noqa: ARG005 - nobody listens
@@ -136,16 +137,17 @@ class Supervisor:
         """Args:
         commands: a command line per process.
         output_dir: what they print is in `<process>.out` there.
+        spares: a command line per role of which one process waits, loaded, to be the next life.
         restarts: decides on who died; None: any death ends the run.
         vitals: says who is stuck, which whoever calls `supervise` keeps informed; None: nobody ever is.
         tell: called with what happens.
         """
-        self._children = Children(commands, output_dir)
+        self._children = Children(commands, output_dir, spares)
         self._restarts = restarts
         self._vitals = vitals
+        self._watchdog = None if vitals is None else Watchdog(vitals, self._children.pid)
         self._tell = tell
         self._dead: set[str] = set()  # whose death has been entered
-        self._watchdog = None if vitals is None else Watchdog(vitals, self._children.pid)
         self._due_ns: dict[str, int] = {}  # of the dead: when their next life begins
         self._hung: set[str] = set()  # killed for that, and not seen to end yet
         self._leaders = {name for name in commands if role_of(name) == role_of(next(iter(commands)))}
@@ -207,6 +209,7 @@ class Supervisor:
                 return End("duration", failures)
             self._kill_stuck()
             failures += self._start_due()
+            self._children.tend(time.monotonic())
             if failures:
                 return End("failed", failures)
             on_poll(frozenset())
@@ -248,28 +251,29 @@ class Supervisor:
         for process in self._watchdog.hung(time.monotonic_ns()):
             self._hung.add(process)
             self._children.signal(process, signal.SIGKILL)
+        for process in self._watchdog.starving():
+            self._happened(process, "starved", None, "does not say that its loop turns: it waits for a core")
 
     def _start_due(self) -> list[Failure]:
         now_ns = time.monotonic_ns()
-        for process in self._watchdog.starving():
-            self._happened(process, "starved", None, "does not say that its loop turns: it waits for a core")
         failures: list[Failure] = []
         for process in [name for name, due_ns in self._due_ns.items() if now_ns >= due_ns]:
             del self._due_ns[process]
             try:
-                self._start(process)
+                spared = self._start(process)
             except OSError as error:  # no memory, no file descriptors: that may pass
                 failure = self._died(process, NOT_STARTED, error)
                 failures += [failure] if failure else []
             else:
-                self._happened(process, "restarted", None, "is started again")
+                self._happened(process, "restarted", None, "is started again" + " from its spare" * spared)
         return failures
 
-    def _start(self, process: str) -> None:
-        self._children.start(process)
+    def _start(self, process: str) -> bool:
+        spared = self._children.start(process)
         self._dead.discard(process)
         if self._vitals is not None:
             self._vitals.started(process)
+        return spared
 
     def _happened(self, process: str, what: What, code: int | None, text: str) -> None:
         self._tell(Happening(time.monotonic_ns(), process, what, code, f"{process} {text}"))

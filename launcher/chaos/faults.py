@@ -82,12 +82,16 @@ class Life:
                 signal.pidfd_send_signal(self._descriptor, SIGNALS[deed])
 
     def age_ns(self) -> int:
-        """Since its beginning; 0 if it is over."""
-        try:
-            text = (PROC / str(self._pid) / "stat").read_text()
-        except OSError:
+        """Since its beginning; 0 if it is over. That of a spare is when it began to be more than one
+        (`launcher.spares`): while it waits it has one thread.
+        """
+        begun: list[int] = []  # its threads, in the system's ticks since the boot
+        for path in (PROC / str(self._pid)).glob("task/*/stat"):
+            with suppress(OSError):  # a thread that ends meanwhile
+                begun.append(int(path.read_text().rpartition(")")[2].split()[19]))
+        if not begun:
             return 0
-        begun_s = int(text.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")  # since the boot
+        begun_s = sorted(begun)[:2][-1] / os.sysconf("SC_CLK_TCK")
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - round(begun_s * 1e9)
 
     def release(self) -> None:

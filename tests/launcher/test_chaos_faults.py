@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from launcher.chaos.faults import Done, Execution, Interface, Lives
+from launcher.chaos.faults import Done, Execution, Interface, Life, Lives
 from launcher.chaos.plan import Deed, Fault
 from rtcore.channels import AGENT, LEARNER, RECORDER
 from rtcore.clock import VirtualClock
@@ -122,6 +122,27 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.002)
+
+
+THREADS = """
+import threading, time
+for _ in range(2):
+    threading.Thread(target=time.sleep, args=(60,)).start()
+    time.sleep(0.3)
+print(flush=True)
+"""
+
+
+def test_a_life_is_as_old_as_its_first_threads() -> None:
+    command = [sys.executable, "-c", THREADS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        life = Life(process.pid)
+        assert 0.55 * S < life.age_ns() < 20 * S
+        process.kill()
+    assert life.age_ns() == 0
+    life.release()
 
 
 def state(pid: int) -> str:

@@ -25,17 +25,23 @@ DURATION_S, HZ = 14, 50
 VICTIMS = (AGENT, ENV_SERVER, RECORDER, LEARNER)  # the learner last: it takes seconds to come back, and only
 # an env server that lives has what it missed
 pytestmark = pytest.mark.timeout(120)
+SPARE = "agent_service.spare"
 QUICK = ("--supervise.first-s", "0.1", "--supervise.stuck-s", "2")
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A run and how it ended."""
+    """A run and how it ended.
+
+    Attributes:
+        spares: those that were there before the agent's lives ended, and each next life of it.
+    """
 
     path: Path
     output: str
     code: int
     summary: dict[str, Any]
+    spares: list[tuple[int, int]]
 
 
 def pid_of(run: Path, process: str, limit_s: float = 10.0) -> int:
@@ -53,30 +59,43 @@ def pid_of(run: Path, process: str, limit_s: float = 10.0) -> int:
 
 def kill_each(run: Path) -> Finished:
     """A run in which each process is killed once, and then the agent stopped for longer than `stuck_s`."""
+    spares = []
     settings = (*SMALL, *QUICK, "--duration-s", str(DURATION_S), "--run-dir", str(run))
     with running("run", "pointmass", *settings) as process:
         wait_for_ticks(run, process)
         for victim in VICTIMS:
             time.sleep(1.2)
+            spares += [pid_of(run, SPARE)] if victim == AGENT else []
             os.kill(pid_of(run, victim), signal.SIGKILL)
+        second = pid_of(run, AGENT)
         time.sleep(2.0)
-        os.kill(pid_of(run, AGENT), signal.SIGSTOP)
+        spares.append(pid_of(run, SPARE))
+        os.kill(second, signal.SIGSTOP)
+        third = next_life(run, second)
         output = finish(process, 60)
-    return Finished(run, output, process.returncode, summary_of(run))
+    lives = [(spares[0], second), (spares[1], third)]
+    return Finished(run, output, process.returncode, summary_of(run), lives)
+
+
+def next_life(run: Path, pid: int) -> int:
+    """The agent after that one."""
+    while (found := pid_of(run, AGENT)) == pid:
+        time.sleep(0.02)
+    return found
 
 
 def kill_twice(run: Path) -> Finished:
-    """A run whose agent dies more often than allowed."""
+    """A run whose agent dies more often than allowed, for the first time together with its spare."""
     settings = (*SMALL, "--supervise.limit", "1", "--duration-s", "60", "--run-dir", str(run))
     with running("run", "pointmass", *settings, "--no-record") as process:
         wait_for_ticks(run, process)
-        first = pid_of(run, AGENT)
-        os.kill(first, signal.SIGKILL)
-        while (second := pid_of(run, AGENT)) == first:
-            time.sleep(0.02)
+        first, spare = pid_of(run, AGENT), pid_of(run, SPARE)
+        for pid in (spare, first):
+            os.kill(pid, signal.SIGKILL)
+        second = next_life(run, first)
         os.kill(second, signal.SIGKILL)
         output = finish(process, 30)
-    return Finished(run, output, process.returncode, summary_of(run))
+    return Finished(run, output, process.returncode, summary_of(run), [(spare, second)])
 
 
 def play(home: Path) -> tuple[Finished, Finished]:
@@ -120,12 +139,21 @@ def test_each_death_and_each_restart_is_told_once(finished: Finished) -> None:
     assert f"{ENV_SERVER} died (signal SIGKILL); it is started again in 0.1 s" in finished.output
 
 
+def test_each_next_life_of_the_agent_is_a_spares(finished: Finished) -> None:
+    (first, second), (another, third) = finished.spares
+    assert (first, another) == (second, third)
+    assert first != another
+    left = ["pgrep", "-f", "--", f"--run {finished.path} "]
+    assert subprocess.run(left, capture_output=True, text=True, check=False).stdout == ""
+
+
 def test_the_recording_has_all_of_it(finished: Finished) -> None:
     _, lines = texts(finished.path / "recording.rrd", "/log")
     for process in PROCESSES:
         died = f"[launcher] {process} died (signal SIGKILL); it is started again in 0.1 s"
         assert lines.count(died) == 1, lines
-        assert lines.count(f"[launcher] {process} is started again") == 1 + (process == AGENT), lines
+        again = f"[launcher] {process} is started again" + " from its spare" * (process == AGENT)
+        assert lines.count(again) == 1 + (process == AGENT), lines
     assert lines.count("[launcher] agent_service hung and was killed; it is started again in 0.2 s") == 1
     ticks, _ = columns(finished.path / "recording.rrd", "/env/reward")
     assert len(ticks) == len(set(ticks.tolist()))
@@ -158,6 +186,9 @@ def test_a_process_that_dies_more_often_than_allowed_ends_the_run_loudly(given_u
     gave_up = "agent_service died 2 times in a row (2 x signal SIGKILL)"
     assert f"{gave_up}: the run ends" in given_up.output
     assert f"tenuto: {gave_up}; its last lines:" in given_up.output
+    ((spare, second),) = given_up.spares
+    assert spare != second
+    assert f"{AGENT} is started again\n" in given_up.output
     summary = given_up.summary
     assert summary["ended"] == gave_up
     assert summary["forced"] == []
