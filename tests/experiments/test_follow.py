@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -163,8 +164,18 @@ def test_a_failing_run_is_told() -> None:
         carry_out([*command("sim", "auto", Path("none.csv"), Course(40), 0, Path("run"), ())[:4], "nowhere"])
 
 
-def test_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The recorded run is one; what comes of the others is made up."""
+def test_what_is_written(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recorded run is the one above; what comes of the others is made up."""
+
+    def carried_out(arguments: list[str]) -> None:
+        drift, home = (
+            Path(arguments[arguments.index(name) + 1]) for name in ("--env.drift.path", "--run-dir")
+        )
+        assert arguments == command("sim", "auto", drift, Course(40), 0, home, ["--record"])
+        assert drift.read_bytes() == (run.parent / "drift.csv").read_bytes()
+        shutil.copytree(run, home)
+
+    monkeypatch.setattr("experiments.follow.carry_out", carried_out)
     lived = [Lived([0, 9] * 3, np.full(120, value), np.zeros(120)) for value in (1.0, 2.0)]
     monkeypatch.setattr("experiments.follow.repeat", lambda *_: {"auto": lived, "live": lived[::-1]})
     picture = tmp_path / "docs" / "follow.png"

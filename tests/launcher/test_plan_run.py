@@ -17,7 +17,6 @@ from launcher.plan.envelope import fit
 from launcher.plan.estimate import _scales, local_changes
 from launcher.plan.picture import draw_plan
 from rtcore.config import DriftConfig
-from tests.launcher.commands import tenuto
 
 PLAN = settle({"window": 20, "c_45": 6.164, "eta": 1.0, "tau": 0.1, "alpha_1": 1.01})
 
@@ -80,15 +79,15 @@ def test_a_plan_from_a_run(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The chain's s rises by 1/40 a unit, and with it both ends' rewards by 1/80: B(t, t + j) = j / 80."""
-    lived = tenuto(
+    monkeypatch.chdir(tmp_path)
+    lived = [
         "sim", "chain", "--duration-s", "5", "--run-dir", "lived", "--env.drift.kind", "ramp",
         "--env.count", str(count),
         "--env.drift.span", "40", "--learner.schedule.l-f", "8", "--learner.schedule.gamma-f", "0.5",
-        cwd=tmp_path,
-    )  # fmt: skip
-    assert lived.returncode == 0, lived.stderr
-    done = tenuto("plan", "lived", "--c-1", "0.5", "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    ]  # fmt: skip
+    assert run_command(lived) == 0
+    assert run_command(["plan", "lived", "--c-1", "0.5", "--out", "out"]) == 0
+    assert capsys.readouterr().err == ""
     told = json.loads((tmp_path / "out/plan.json").read_text())
     value = {name: one["value"] for name, one in told["constants"].items()}
     origin = {name: one["from"] for name, one in told["constants"].items()}
@@ -104,7 +103,6 @@ def test_a_plan_from_a_run(
     assert told["unit_s"] == 0.2
     assert any("exact" in remark for remark in told["remarks"])
     assert ("what is recorded is of env0, the first of 2" in told["remarks"]) == (count == 2)
-    monkeypatch.chdir(tmp_path)
     config = Path("lived/run.toml").read_text()
     for before, after in (("\ngamma = 0.9\n", "\ngamma = 1.0\n"), ('"npg"', '"q"')):  # q may, npg may not
         assert before in config

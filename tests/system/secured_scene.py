@@ -76,8 +76,8 @@ class Scene:
         return found
 
     def version(self) -> int:
-        """Of the policy that acted last."""
-        return self.steps[-1].policy_version if self.steps else -1
+        """Of the policy that acted last; -1: none has yet."""
+        return next((one.policy_version for one in reversed(self.steps) if one.policy_version >= 0), -1)
 
     def policy(self, version: int, run: str = "run") -> Policy:
         """Signed by the learner."""

@@ -10,10 +10,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,6 +24,7 @@ from recorder import reading
 from rtcore.channels import AGENT, LEARNER, PROCESSES, RECORDER
 from rtcore.run_dir import RunDir
 
+pytestmark = pytest.mark.timeout(120)  # others are played beside it
 RUN = ("bandit", "--env.hz", "50", "--duration-s", "0")  # a world whose learner is up in no time
 
 
@@ -94,10 +96,8 @@ def up(runs: Path) -> Iterator[Engine]:
         yield engine
 
 
-@pytest.fixture(scope="module")
-def story(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+def play(runs: Path) -> dict[str, object]:
     """Up, healthy, the agent killed and started again by its policy, healthy, down."""
-    runs = tmp_path_factory.mktemp("runs")
     with up(runs) as engine:
         deadline = time.monotonic() + 40
         log = runs / "live" / "logs" / "env_server.jsonl"
@@ -115,6 +115,12 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
         "runs": runs, "pids": {name: one.pid for name, one in engine.running.items()}, "found": found,
         "first": first, "killed": killed, "second": second, "codes": codes,
     }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def story(played: Callable[[str], Any]) -> dict[str, object]:
+    found: dict[str, object] = played("test_compose")
+    return found
 
 
 def test_every_service_runs_and_is_healthy(story: dict[str, object]) -> None:

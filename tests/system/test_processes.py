@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,6 +21,7 @@ from launcher.summary import discrepancies
 from recorder.reading import columns, spans, texts
 from rtcore.run_dir import RunDir
 
+pytestmark = pytest.mark.timeout(120)  # others are played beside each
 UNIT_NS = 500_000_000
 SMALL = (
     "--env.hz", "50", "--env.unit-s", "0.5", "--env.episode-steps", "40", "--learner.learning-starts", "30",
@@ -74,32 +74,37 @@ def wait_for_ticks(run: Path, process: subprocess.Popen[str], timeout_s: float =
     raise AssertionError(f"no tick within {timeout_s} s")
 
 
-def play_whole(run: Path) -> None:
+def play_whole(home: Path) -> Path:
     """Ten seconds of point mass with all four processes."""
+    run = home / "run"
     done = subprocess.run(
         tenuto("run", "pointmass", "--duration-s", "10", "--run-dir", str(run), *SMALL),
         capture_output=True, text=True, timeout=90, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
+    return run
 
 
-def play_held(run: Path) -> None:
-    """A run that an operator holds and resumes."""
+def play_held(home: Path) -> Path:
+    """A run that an operator holds and resumes, after two seconds each: four units, and so four policies."""
+    run = home / "run"
     always = ("--learner.schedule.gamma-f", "1.0", "--duration-s", "60", "--run-dir", str(run))
     with running("run", "pointmass", *SMALL, *always) as process:
         wait_for_ticks(run, process)
-        time.sleep(3.0)
+        time.sleep(2.0)
         order(run, "hold")
-        time.sleep(3.0)
+        time.sleep(2.0)
         order(run, "resume")
-        time.sleep(3.0)
+        time.sleep(2.0)
         assert "gradient steps" in order(run, "status")
         order(run, "stop")
         finish(process, 30)
         assert process.returncode == 0
+    return run
 
 
-def play_interrupted(run: Path) -> None:
+def play_interrupted(home: Path) -> Path:
+    run = home / "run"
     with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
         wait_for_ticks(run, process)
         time.sleep(2.0)
@@ -109,9 +114,11 @@ def play_interrupted(run: Path) -> None:
         took_s = time.monotonic() - begin
     assert process.returncode == 0, output
     assert took_s < 7.0, output  # 5 s are promised; 2 more for a busy machine
+    return run
 
 
-def play_interrupted_twice(run: Path) -> None:
+def play_interrupted_twice(home: Path) -> Path:
+    run = home / "run"
     with running("run", "pointmass", *SMALL, "--duration-s", "60", "--run-dir", str(run)) as process:
         wait_for_ticks(run, process)
         process.send_signal(signal.SIGINT)
@@ -119,17 +126,22 @@ def play_interrupted_twice(run: Path) -> None:
         process.send_signal(signal.SIGINT)
         finish(process, 10)
     assert process.returncode == 130
+    return run
 
 
-def play_sequence(sequence: Sequence[str], run: Path) -> None:
-    """Each process by its own command, in that order; the first one makes the run."""
-    settings = ("pointmass", *SMALL, "--env.start-wait-s", "3", "--duration-s", "14", "--run-dir", str(run))
+def play_sequence(sequence: Sequence[str], home: Path) -> Path:
+    """Each process by its own command, in that order; the first one makes the run.
+
+    A world that is first has waited for the others, and goes on without them, when the next one starts.
+    """
+    run, duration_s = home / "run", 14 if sequence[0] == "env" else 10  # then the learner comes late
+    settings = ("--env.start-wait-s", "1.5", "--duration-s", str(duration_s), "--run-dir", str(run))
     started: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for command in sequence:
-            arguments = tenuto(command, *(settings if not started else ("--run-dir", str(run))))
+            arguments = tenuto(command, *(("pointmass", *SMALL, *settings) if not started else settings[-2:]))
             started[command] = subprocess.Popen(arguments)
-            time.sleep(4.0 if command == "env" else 1.0)
+            time.sleep(3.0 if command == "env" else 1.0)
         assert started["env"].wait(45) == 0
         for command in ("agent", "learn", "record"):
             started[command].send_signal(signal.SIGTERM)
@@ -137,10 +149,10 @@ def play_sequence(sequence: Sequence[str], run: Path) -> None:
     finally:
         for process in started.values():
             process.kill()
+    return run
 
 
-# By the name of the fixture that waits for it. Two at a time, for two cores: they mostly wait.
-STORIES: dict[str, Callable[[Path], None]] = {
+STORIES: dict[str, Callable[[Path], Path]] = {
     "env_last": partial(play_sequence, ("record", "learn", "agent", "env")),
     "env_first": partial(play_sequence, ("env", "agent", "record", "learn")),
     "held_run": play_held,
@@ -150,30 +162,13 @@ STORIES: dict[str, Callable[[Path], None]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def played_here(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Callable[[str], Path]]:
-    """Where the run of a story is, once it is over; raises what it raised."""
-    here = [item for item in request.session.items if item.path == request.path]
-    wanted = {name for item in here if isinstance(item, pytest.Function) for name in item.fixturenames}
-    homes = {name: tmp_path_factory.mktemp(name) / "run" for name in STORIES if name in wanted}
-    with ThreadPoolExecutor(2) as pool:
-        futures = {name: pool.submit(STORIES[name], home) for name, home in homes.items()}
-
-        def told(name: str) -> Path:
-            futures[name].result()
-            return homes[name]
-
-        yield told
-
-
 def story(name: str) -> Any:
     """The fixture of a story: its run."""
 
-    @pytest.fixture(name=name)
-    def told(played_here: Callable[[str], Path]) -> Path:
-        return played_here(name)
+    @pytest.fixture(name=name, scope="module")
+    def told(played: Callable[[str], Any]) -> Path:
+        run: Path = played(f"test_processes.{name}")
+        return run
 
     return told
 

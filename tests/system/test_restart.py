@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 import signal
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,6 +33,8 @@ from rtcore.config import (
 from rtcore.messages import Stats, Step
 from rtcore.run_dir import RunDir
 from tests.system.cast import cast
+
+pytestmark = pytest.mark.timeout(120)  # others are played beside it
 
 TICK_NS, TICKS = 10_000_000, 700
 DRIFT = DriftConfig(kind="sine", amplitude=1.0, omega=0.7)
@@ -67,9 +72,8 @@ class Story:
         return [life.counters.get(name, 0) for life in self.stats[process]]
 
 
-@pytest.fixture(scope="module")
-def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
-    with cast(tmp_path_factory.mktemp("restart") / "run", CONFIG) as on:
+def play(home: Path) -> Story:
+    with cast(home / "run", CONFIG) as on:
         on.start(*PROCESSES)
         on.watch_until(lambda: len(on.steps) >= 150)
         env_killed_ns = on.send(ENV_SERVER, signal.SIGKILL)
@@ -86,6 +90,12 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
         for life in on.run.read_final_stats():
             stats.setdefault(life.process, []).append(life)
         return Story(on.run, on.steps, stats, env_killed_ns, agent_killed_ns, agent_began_ns)
+
+
+@pytest.fixture(scope="module")
+def story(played: Callable[[str], Any]) -> Story:
+    found: Story = played("test_restart")
+    return found
 
 
 def test_the_world_goes_on_by_its_first_clock_to_its_original_end(story: Story) -> None:

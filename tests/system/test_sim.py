@@ -102,19 +102,21 @@ def assert_equal_networks(one: bytes, other: bytes) -> None:
         assert left[name].tobytes() == right[name].tobytes(), name
 
 
-def test_with_the_forecast_it_is_not_sac(tmp_path: Path) -> None:
-    schedule = ScheduleConfig(l_f=5, gamma_f=0.6)
-    plain = run(tmp_path / "sac", small(algo="sac", schedule=schedule))
-    forecasting = run(tmp_path / "fsac", small(algo="fsac", schedule=schedule))
-    assert forecasting[0]["returns"] != plain[0]["returns"]
+def test_with_the_forecast_it_is_not_sac(once: tuple[Summary, bytes], tmp_path: Path) -> None:
+    assert small().learner.algo == "sac"
+    forecasting = run(tmp_path / "fsac", small(algo="fsac"))
+    assert forecasting[0]["returns"] != once[0]["returns"]
     assert forecasting[0]["forecast"]["windows"] == 3  # window 0 has no past; the last is not over
 
 
 def test_it_learns_to_follow(tmp_path: Path) -> None:
-    """Two minutes of point mass: the last episodes beat the first ones, which pi_0 acted, by far."""
+    """A minute of point mass: the last episodes beat the first ones, which pi_0 acted, by far.
+
+    To 0.4 of them; with two other seeds to 0.3 and 0.5, and no less after two minutes.
+    """
     preset = pointmass()
     learner = replace(preset.learner, hidden=(32, 32), batch=64)
-    config = replace(small(), duration_s=120.0, learner=learner)
+    config = replace(small(), duration_s=60.0, learner=learner)
     returns = run(tmp_path / "long", config)[0]["returns"]
     assert fmean(returns[-20:]) > 0.6 * fmean(returns[:3])  # returns are negative
 
