@@ -23,8 +23,8 @@ GROUPS = (
     (("test_killed",), ("test_rogues", "test_compose"), ("test_two_hosts",)),
     (
         ("test_processes.env_last", "test_processes.held_run"),
-        ("test_processes.env_first", "test_processes.whole_run"),
-        ("test_processes.interrupted_run",),
+        # The last, when the others have hardly anything to do: its end has a limit of seconds.
+        ("test_processes.env_first", "test_processes.whole_run", "test_processes.interrupted_run"),
     ),
 )
 
