@@ -31,17 +31,18 @@ def main() -> int:
 
     from agent_service.serving import serve
     from rtcore import channels
-    from rtcore.process import WRONG_INPUT, parse, run_process
+    from rtcore.process import FAILED, parse, run_process
 
     parse(channels.AGENT, ["--run", ""])  # argparse, too, loads parts of itself when they are first used
-    line = sys.stdin.readline()
-    if not line.strip():
-        return NO_ORDER
     try:
+        command_line.room()  # else it is of no use, and better gone before it gets an order
+        line = sys.stdin.readline()
+        if not line.strip():
+            return NO_ORDER
         arguments = _obey(line)
     except (ValueError, KeyError, TypeError, OSError) as error:
-        sys.stderr.write(f"{channels.AGENT}: order {line.strip()!r}: {error!r}\n")
-        return WRONG_INPUT
+        sys.stderr.write(f"{channels.AGENT}: its spare cannot take over: {error!r}\n")
+        return FAILED  # so that the next life begins from nothing
     signal.signal(signal.SIGINT, at_interrupt)
     return run_process(channels.AGENT, serve, arguments)
 

@@ -54,8 +54,8 @@ class Children:
             try:
                 yield
             finally:
-                self._spares.end()
                 self.kill(self.running())
+                self._spares.end()
 
     def start(self, name: str) -> bool:
         """Begin a life; says whether a spare took it on.

@@ -69,11 +69,14 @@ def health(argv: Sequence[str]) -> int:
     except BusError as error:
         raise CommandError(str(error)) from error
     if age_s is None:
-        what = f"{chosen.process} has not turned for {stuck_s:g} s"
-        if (waiting_s := waited_s(delays, clock)) > stuck_s / 2:
-            raise CommandError(f"{what}, and waited for a core for {waiting_s:.1f} s")
-        killed = chosen.kill_stuck and kill(run_dir.path, chosen.process)
-        raise CommandError(what + (" and was killed" if killed else ""))
+        waiting_s = waited_s(delays, clock)
+        starved = waiting_s > stuck_s / 2
+        killed = chosen.kill_stuck and not starved and kill(run_dir.path, chosen.process)
+        raise CommandError(
+            f"{chosen.process} has not turned for {stuck_s:g} s"
+            + (f", and waited for a core for {waiting_s:.1f} s" if starved else "")
+            + (" and was killed" if killed else "")
+        )
     Console().print(f"{chosen.process} turned {age_s:.2f} s ago", highlight=False)
     return DONE
 

@@ -40,6 +40,8 @@ from rtcore.zenoh_bus import open_bus
 
 RUNS = Path("runs")
 NICENESS = 5  # drawing a screen is never worth a missed deadline
+# What a run says whose pairs of env server and agent take every core.
+FULL = "{count} environments at {hz:g} Hz have all cores: learner and recorder get what they leave"
 
 
 def run(argv: Sequence[str]) -> int:
@@ -129,6 +131,18 @@ def _spares(config: RunConfig, run_dir: RunDir) -> dict[str, list[str]]:
     return {channels.AGENT: spare_command(command_for(last, run_dir.path))}
 
 
+def _supervisor(config: RunConfig, run_dir: RunDir, lookout: Lookout) -> Supervisor:
+    """Of the run's processes, told of by `lookout`."""
+    return Supervisor(
+        {name: command_for(name, run_dir.path) for name in _wanted(config)},
+        run_dir.logs_dir,
+        spares=_spares(config, run_dir),
+        restarts=Restarts(config.supervise),
+        vitals=lookout.vitals,
+        tell=lookout.happened,
+    )
+
+
 def _carry_out(
     config: RunConfig,
     run_dir: RunDir,
@@ -138,23 +152,12 @@ def _carry_out(
     interrupts: Interrupts,
 ) -> End:
     """Start the processes, watch over them, end them."""
-    wanted = _wanted(config)
     crew = Crew(0, config.env.count, config.env.hz or 0.0)
     viewer = Viewer(config.recorder, run_dir.logs_dir / "viewer.out")
     lookout = Lookout(watch, Vitals(config.supervise.stuck_s), screen, viewer, clock)
-    supervisor = Supervisor(
-        {name: command_for(name, run_dir.path) for name in wanted},
-        run_dir.logs_dir,
-        spares=_spares(config, run_dir),
-        restarts=Restarts(config.supervise),
-        vitals=lookout.vitals,
-        tell=lookout.happened,
-    )
-    if config.agent.rt != "off" and crew.fills(cores := len(realtime.allowed_cores())):
-        screen.say(
-            f"{crew.count} environments at {crew.hz:g} Hz with their agents go first on all {cores} cores:"
-            " learner and recorder get what they leave"
-        )
+    supervisor = _supervisor(config, run_dir, lookout)
+    if config.agent.rt != "off" and crew.fills(len(realtime.allowed_cores())):
+        screen.say(FULL.format(count=crew.count, hz=crew.hz))
     with supervisor.started():
         os.nice(NICENESS)
         with (
@@ -174,7 +177,7 @@ def _carry_out(
             lookout.join(bus)
             end = supervisor.supervise(interrupts, lookout.look)
             lookout.look(frozenset())  # the last messages
-    unfinished = channels.RECORDER in wanted and not supervisor.ended_well(channels.RECORDER)
+    unfinished = channels.RECORDER in _wanted(config) and not supervisor.ended_well(channels.RECORDER)
     if unfinished and end.reason != "killed":
         mend(run_dir.recording_path, interrupts)
     return end

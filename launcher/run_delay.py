@@ -27,7 +27,9 @@ class Thread:
 
 def grown_ns(before: Thread, now: Thread, elapsed_ns: int) -> int:
     """How long a thread waited in the last `elapsed_ns`."""
-    if now.runnable and now.ran_ns == before.ran_ns:  # a wait that is not over
+    # Ready at both ends and not on a core in between: a wait that is not over. 0 is what a kernel says that
+    # does not count.
+    if before.runnable and now.runnable and 0 < now.ran_ns == before.ran_ns:
         return elapsed_ns
     return min(now.waited_ns - before.waited_ns, elapsed_ns)
 

@@ -17,6 +17,9 @@ START_NS = 60_000_000_000  # from a start to the first turn: learning's librarie
 # The launcher looks 20 times a second. A longer pause between two looks was its own: it was stopped, or the
 # machine was, and so may have been the others.
 LONGEST_LOOK_NS = 500_000_000
+# A thread that hangs, too, is woken now and then and waits for a moment. Of a silence for want of a core more
+# than this share of the limit was waiting: half of it, if all since somebody looked was.
+STARVED_SHARE = 0.25
 # All processes speak four times a second each. Hearing nobody for so long, the launcher is the deaf one.
 DEAF_NS = 1_000_000_000
 # A silence of so many times the limit is a hang whatever excuses it: one thread may wait for a core for as
@@ -102,12 +105,15 @@ class Vitals:
         ]
 
     def starving(self) -> list[str]:
-        """Who would be stuck if nothing were excused and is not; each once in a silence."""
+        """Who would be stuck but for what is excused, which is no small part; each once in a silence."""
         stuck = self.stuck()
         found = [
             name
             for name, life in self._lives.items()
-            if not life.starved and name not in stuck and self.silent_ns(name) > self._limit_ns(life)
+            if not life.starved
+            and name not in stuck
+            and self.silent_ns(name) > (limit_ns := self._limit_ns(life))
+            and life.excused_ns > STARVED_SHARE * limit_ns
         ]
         for name in found:
             self._lives[name].starved = True

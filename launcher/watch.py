@@ -74,7 +74,7 @@ class Watch:
 
     Attributes:
         events: what the processes said, newest last.
-        happenings: all deaths and restarts.
+        happenings: all deaths and restarts, and silences for want of a core.
         restarts: how often each process was started again.
         down: processes between two lives, or given up.
         refused: messages of lives beyond what there can be.
@@ -114,6 +114,8 @@ class Watch:
     def happened(self, happening: Happening) -> None:
         """Take note of a death or a restart. Nothing that an earlier life said tells how the next one is."""
         self.happenings.append(happening)
+        if happening.what == "starved":  # it lives
+            return
         process = happening.process
         self._seen_ns.pop(process, None)
         self._recent.pop(process, None)

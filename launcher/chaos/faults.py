@@ -86,9 +86,10 @@ class Life:
         (`launcher.spares`): while it waits it has one thread.
         """
         begun: list[int] = []  # its threads, in the system's ticks since the boot
-        for path in (PROC / str(self._pid)).glob("task/*/stat"):
-            with suppress(OSError):  # a thread that ends meanwhile
-                begun.append(int(path.read_text().rpartition(")")[2].split()[19]))
+        with suppress(OSError):  # the process ends meanwhile
+            for path in (PROC / str(self._pid)).glob("task/*/stat"):
+                with suppress(OSError):  # a thread does
+                    begun.append(int(path.read_text().rpartition(")")[2].split()[19]))
         if not begun:
             return 0
         begun_s = sorted(begun)[:2][-1] / os.sysconf("SC_CLK_TCK")

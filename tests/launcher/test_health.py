@@ -5,12 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from launcher import health
 from launcher.cli import run_command
+from launcher.run_delay import RunDelay
 from launcher.starting import process_command
 from rtcore.channels import LEARNER, STATS
 from rtcore.config import RunConfig
@@ -77,6 +79,41 @@ def test_only_a_process_that_had_the_time_to_turn_is_killed(
             assert not health.kill(tmp_path, "some_role")
         finally:
             process.kill()
+
+
+@pytest.mark.parametrize(("waited_s", "killed"), [(0.4, True), (0.6, False)])
+def test_who_waited_for_a_core_is_left_alone(
+    waited_s: float,
+    killed: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = RunDir.create(tmp_path / "r1", replace(CONFIG, supervise=replace(CONFIG.supervise, stuck_s=1.0)))
+    monkeypatch.setattr(health, "START_NS", 0)
+    monkeypatch.setattr(health, "waited_s", lambda delays, clock: waited_s * len(delays))
+    (tmp_path / "learner.py").write_text("import time\nprint('up', flush=True)\ntime.sleep(60)\n")
+    command = process_command(LEARNER, run.path)
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            assert run_command(["health", LEARNER, "--run-dir", str(run.path), "--kill-stuck"]) == 1
+            assert (process.wait(5) if killed else process.poll()) == (-9 if killed else None)
+        finally:
+            process.kill()
+    how = " and was killed" if killed else ", and waited for a core for 0.6 s"
+    assert capsys.readouterr().err == f"tenuto: learner has not turned for 1 s{how}\n"
+
+
+def test_how_long_it_waited_is_the_longest_of_its_lives() -> None:
+    class Delay(RunDelay):
+        def grown_ns(self, now_ns: int) -> int:
+            return 2 * S if self._pid == 1 else S
+
+    clock = MonotonicClock()
+    assert health.waited_s([Delay(0), Delay(1)], clock) == 2.0
+    assert health.waited_s([], clock) == 0.0
 
 
 def test_wrong_input(tmp_path: Path) -> None:

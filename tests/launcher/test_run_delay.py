@@ -22,16 +22,25 @@ IDLE = "print('up', flush=True)\nimport time\nwhile True: time.sleep(1)"
 @pytest.mark.parametrize(
     ("now", "expected_ms"),
     [
-        (Thread(5 * MS, 30 * MS, runnable=False), 20),  # it waited 20 ms and did its work
-        (Thread(5 * MS, 30 * MS, runnable=True), 20),  # it is at work
-        (Thread(0, 10 * MS, runnable=True), 50),  # it waits, and that is not entered yet
-        (Thread(0, 10 * MS, runnable=False), 0),  # it sleeps, or is stopped
-        (Thread(1 * MS, 910 * MS, runnable=False), 50),  # a wait of 0.9 s is over; most of it was before
+        (Thread(9 * MS, 30 * MS, runnable=False), 20),  # it waited 20 ms and did its work
+        (Thread(9 * MS, 30 * MS, runnable=True), 20),  # it is at work
+        (Thread(4 * MS, 10 * MS, runnable=True), 50),  # it waits, and that is not entered yet
+        (Thread(4 * MS, 10 * MS, runnable=False), 0),  # it sleeps, or is stopped
+        (Thread(5 * MS, 910 * MS, runnable=False), 50),  # a wait of 0.9 s is over; most of it was before
     ],
 )
 def test_the_rule(now: Thread, expected_ms: int) -> None:
-    before = Thread(0, 10 * MS, runnable=True)
+    before = Thread(4 * MS, 10 * MS, runnable=True)
     assert grown_ns(before, now, 50 * MS) == expected_ms * MS
+
+
+def test_who_has_just_been_woken_did_not_wait_before() -> None:
+    asleep, woken = Thread(4 * MS, 10 * MS, runnable=False), Thread(4 * MS, 10 * MS, runnable=True)
+    assert grown_ns(asleep, woken, 8000 * MS) == 0
+
+
+def test_a_kernel_that_counts_nothing_excuses_nothing() -> None:
+    assert grown_ns(Thread(0, 0, runnable=True), Thread(0, 0, runnable=True), 50 * MS) == 0
 
 
 @contextmanager

@@ -143,6 +143,19 @@ def test_who_starves_is_told_once_in_a_silence() -> None:
         assert watched.vitals.starving() == []  # it has been told
 
 
+def test_who_waited_for_a_moment_does_not_starve() -> None:
+    watched = Watched()
+    for process in (ENV_SERVER, LEARNER):
+        watched.vitals.started(process)
+    watched.look(ENV_SERVER, LEARNER, seconds=1)
+    assert starved(LEARNER, 1.95, watched, share=0.45) == []  # 20 looks: 0.45 s of the limit of 2 s
+    assert starved(LEARNER, 0.05, watched, share=0.45) == []
+    assert watched.vitals.silent_ns(LEARNER) > 2 * SECOND
+    assert watched.vitals.starving() == []
+    assert starved(LEARNER, 0.10, watched, share=0.45) == []
+    assert watched.vitals.starving() == [LEARNER]  # 0.52 s are more than a quarter
+
+
 def test_patience_has_an_end() -> None:
     watched = Watched()
     for process in (ENV_SERVER, LEARNER):

@@ -135,6 +135,15 @@ def test_between_two_lives_nothing_is_known_of_a_process() -> None:
     assert [one.what for one in watch.happenings] == ["died", "restarted", "stuck"]
 
 
+def test_who_starves_lives() -> None:
+    watch = Watch(100.0)
+    watch.feed(ledger(LEARNER, counters={"learned": 7}), SECOND)
+    watch.happened(happening("starved"))
+    assert watch.heard(LEARNER)
+    assert (watch.down, watch.restarts) == (set(), {})
+    assert [one.what for one in watch.happenings] == ["starved"]
+
+
 def test_the_phase_is_that_of_the_newest_life_that_knows_one() -> None:
     watch = Watch(100.0)
     watch.feed(ledger(LEARNER, incarnation=1, windows=[notice(3, "hold")]), 1)

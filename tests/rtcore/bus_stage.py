@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 from tests.rtcore.bus_samples import ZenohWorld
 
 ROOT = Path(__file__).parents[2]
+LIFE_S = 40.0
 
 Child = subprocess.Popen[str]
 Spawn = Callable[..., Child]
@@ -29,8 +31,9 @@ def opened() -> Iterator[ZenohWorld]:
 
 @contextmanager
 def spawning(world: ZenohWorld) -> Iterator[Spawn]:
-    """Start a child and wait until it is connected."""
+    """Start children; whoever lives for too long is killed, so that nobody waits for its words for ever."""
     children: list[Child] = []
+    limits: list[threading.Timer] = []
 
     def start(deed: str, role: str, *arguments: str) -> Child:
         command = [
@@ -44,11 +47,16 @@ def spawning(world: ZenohWorld) -> Iterator[Spawn]:
         ]
         child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         children.append(child)
+        limits.append(threading.Timer(LIFE_S, child.kill))
+        limits[-1].daemon = True
+        limits[-1].start()
         return child
 
     try:
         yield start
     finally:
+        for limit in limits:
+            limit.cancel()
         for child in children:
             child.kill()
             child.communicate()

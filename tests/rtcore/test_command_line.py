@@ -31,6 +31,12 @@ def test_others_see_the_new_words_and_nothing_of_the_old_ones() -> None:
     assert shown(*words) == [f"{expected!r} {words!r}"]
 
 
+def test_a_word_may_be_any_bytes() -> None:
+    command: list[str | bytes] = [sys.executable, "-c", SHOWN, b"/r\xff"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(repr(b"/r\xff\0")[:-1])
+
+
 def test_what_has_no_room_changes_nothing() -> None:
     code = "import sys; from rtcore import command_line; command_line.replace(['x' * 10_000])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

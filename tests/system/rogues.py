@@ -37,6 +37,7 @@ LINK_S = 1.0  # a rogue without a link tries for so long: some ten times
 SENT_S = 0.1  # long enough for what was sent to be there
 APART_S = 0.6  # with the settling: a refused policy is told once a second at most
 SETTLE_S = 0.5  # two of a process's reports
+SETTLED_STEPS = 10  # of the end of it: somebody acted in one of them, or nobody does any more
 FORGED = 777  # the policy version that forged actions claim
 
 # The rogues: each does its worst. Its policies have the version 9.
@@ -193,8 +194,11 @@ def watch(scene: Scene, rogue: Callable[[Scene], int]) -> Traces:
     scene.look()
     told = "".join(path.read_text()[size:] for path, size in zip(logs, sizes, strict=True))
     steps = scene.steps[first:]
+    acted = [step.policy_version for step in steps[-SETTLED_STEPS:] if step.policy_version >= 0]
     counted = scene.counters() - before
-    return Traces(returned, counted, told, {s.policy_version for s in steps}, scene.version(), len(steps) > 5)
+    return Traces(
+        returned, counted, told, {s.policy_version for s in steps}, acted[-1] if acted else -1, len(steps) > 5
+    )
 
 
 def play(home: Path, rogues: Sequence[Callable[[Scene], int]]) -> dict[str, Traces]:
