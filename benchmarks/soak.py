@@ -50,7 +50,9 @@ from rtcore.run_dir import RunDir
 
 PACKAGES = ("eclipse-zenoh", "rerun-sdk", "torch", "numpy")
 POLL_S, SAMPLE_S, LEAST_SAMPLES = 0.2, 2.0, 60
-WARM_UP_S = 300.0  # the logs' caches keep 100 s and Zenoh's and the allocators' pools settle with them
+# The logs' caches keep 100 s, and the pools of Zenoh and of the allocators settle with them; those of the
+# recorder took a last step of some MB in minute 3, 7 or 13, in three long runs.
+WARM_UP_S = 840.0
 BLOCKS = 10
 LIMIT_MB_H = 4.0  # 100 MB in a day
 LIMIT_SHARE = 0.03  # in a half of 15 minutes 1 MB of an env server's 32, 5 MB of a learner's 170

@@ -105,12 +105,12 @@ def test_a_run_with_holes_is_not_judged() -> None:
 @pytest.mark.parametrize(
     ("low", "slope", "grown", "run_s", "told"),
     [
-        (-9.0, 4.0, 0.03, 600.0, "flat"),
-        (4.0, 4.1, 0.03, 600.0, "too short"),
-        (4.1, 5.0, 0.0, 600.0, "grows"),
-        (-9.0, 0.0, 0.031, 600.0, "grows"),
-        (4.1, 5.0, 0.2, 599.0, "too short"),
-        (-1.0, 0.0, 0.0, 599.0, "too short"),
+        (-9.0, 4.0, 0.03, 1680.0, "flat"),
+        (4.0, 4.1, 0.03, 1680.0, "too short"),
+        (4.1, 5.0, 0.0, 1680.0, "grows"),
+        (-9.0, 0.0, 0.031, 1680.0, "grows"),
+        (4.1, 5.0, 0.2, 1679.0, "too short"),
+        (-1.0, 0.0, 0.0, 1679.0, "too short"),
     ],
 )
 def test_flat_and_growing(low: float, slope: float, grown: float, run_s: float, told: str) -> None:
